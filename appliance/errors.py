@@ -1,0 +1,141 @@
+"""The one error tree: every failure a person can meet names its cause and, where there is one, the remedy.
+
+    SwiftbotError
+    ├── ConfigError          a configuration file or option is wrong
+    ├── PayloadError         a message is malformed or too large
+    ├── PrerequisiteError    something the machine must have is missing (Podman, an image, a model)
+    ├── UnreachableError     no gateway, robot or server answered
+    ├── DeadlineError        it answered too late
+    ├── ConflictError        the record has moved on since it was read (optimistic concurrency)
+    ├── NotFoundError        no such task, robot, container, file
+    ├── RefusedError         understood and declined, with the reason (capacity, draining, stale attempt)
+    ├── PlanError            no valid plan for the instruction
+    ├── PoolError            a container could not be started, reached or kept
+    ├── RobotError           a robot did not do what was asked
+    ├── RecordError          a log cannot be written or read
+    └── CancelledByOperator  somebody asked for it to stop
+
+`code` travels over Zenoh in an error reply and is turned back into the same class on the other side.
+`exit_code` is what the command line ends with (docs/configuration.md lists them).
+"""
+
+from typing import ClassVar
+
+
+class SwiftbotError(Exception):
+    """Base of all errors of this product: `message` says what happened, `remedy` what to do about it."""
+
+    code: ClassVar[str] = "internal"
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, message: str, *, remedy: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        """Cause and remedy in one line."""
+        return f"{self.message} ({self.remedy})" if self.remedy else self.message
+
+
+class ConfigError(SwiftbotError):
+    """A configuration file or option is wrong."""
+
+    code = "config"
+    exit_code = 2
+
+
+class PayloadError(SwiftbotError):
+    """A message is malformed or too large; it was counted and dropped."""
+
+    code = "payload"
+    exit_code = 4
+
+
+class PrerequisiteError(SwiftbotError):
+    """Something the machine must have is missing."""
+
+    code = "prerequisite"
+    exit_code = 5
+
+
+class UnreachableError(SwiftbotError):
+    """No gateway, robot or server answered."""
+
+    code = "unreachable"
+    exit_code = 3
+
+
+class DeadlineError(SwiftbotError):
+    """No result within the time allowed."""
+
+    code = "deadline"
+    exit_code = 6
+
+
+class ConflictError(SwiftbotError):
+    """The record has moved on since it was read: read, decide again, retry."""
+
+    code = "conflict"
+
+
+class NotFoundError(SwiftbotError):
+    """What was named does not exist."""
+
+    code = "not-found"
+    exit_code = 4
+
+
+class RefusedError(SwiftbotError):
+    """Understood and declined; the message is the reason."""
+
+    code = "refused"
+    exit_code = 4
+
+
+class PlanError(SwiftbotError):
+    """No valid plan for the instruction; `problems` lists what is wrong with the best attempt."""
+
+    code = "plan"
+    exit_code = 4
+
+    def __init__(self, message: str, *, remedy: str = "", problems: tuple[str, ...] = ()) -> None:
+        super().__init__(message, remedy=remedy)
+        self.problems = problems
+
+
+class PoolError(SwiftbotError):
+    """A container could not be started, reached or kept."""
+
+    code = "pool"
+
+
+class RobotError(SwiftbotError):
+    """A robot did not do what was asked."""
+
+    code = "robot"
+
+
+class RecordError(SwiftbotError):
+    """A log cannot be written or read."""
+
+    code = "record"
+
+
+class CancelledByOperator(SwiftbotError):
+    """Somebody asked for it to stop."""
+
+    code = "cancelled"
+    exit_code = 7
+
+
+def _tree(root: type[SwiftbotError]) -> dict[str, type[SwiftbotError]]:
+    found = {root.code: root}
+    for child in root.__subclasses__():
+        found |= _tree(child)
+    return found
+
+
+def from_code(code: str, message: str, remedy: str = "") -> SwiftbotError:
+    """Rebuild an error that came over the wire; an unknown code becomes the base class."""
+    return _tree(SwiftbotError).get(code, SwiftbotError)(message, remedy=remedy)

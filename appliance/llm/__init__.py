@@ -1,0 +1,1 @@
+"""Instruction to validated plan: prompt, local slot, upstream, rules, cascade."""

@@ -1,0 +1,457 @@
+"""The words everybody shares: plans, task records, containers, gateways, robots, and their wire forms.
+
+All structs are frozen facts; a change makes a new one (`msgspec.structs.replace`). They travel as JSON over
+Zenoh and into MCAP; `docs/schemas/` holds the JSON schemas made from them. Times: `*_ns` are Unix
+nanoseconds for people and logs, never compared between gateways to decide anything; durations are `*_ms` or
+`*_s`, measured on one machine's monotonic clock.
+"""
+
+from enum import StrEnum
+from typing import Any
+
+import msgspec
+from msgspec import Struct, field
+
+VersionVector = dict[str, int]
+"""Gateway id -> number of writes by that gateway seen in this version (Dynamo's version vectors)."""
+
+
+class Tier(StrEnum):
+    """Where a plan came from, cheapest first (algorithms: cascade)."""
+
+    CACHE = "cache"
+    LOCAL = "local"
+    UPSTREAM = "upstream"
+    RULES = "rules"
+
+
+class Subtask(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One node of a plan: a skill of the catalogue on a robot (`None`: computed on a gateway), after others.
+
+    `robot` is a roster name, or `any`, `any1`, ... until the task manager binds it, or `all`.
+    """
+
+    id: str
+    skill: str
+    robot: str | None = None
+    params: dict[str, Any] = field(default_factory=dict[str, Any])
+    after: tuple[str, ...] = ()
+
+
+class Plan(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A graph of subtasks for one instruction, with where it came from and how sure that tier is (0 to 1)."""
+
+    domain: str
+    subtasks: tuple[Subtask, ...]
+    tier: Tier = Tier.RULES
+    confidence: float = 0.0
+    latency_ms: float = 0.0
+
+
+class TaskState(StrEnum):
+    """Life of a task. The last three are final."""
+
+    ACCEPTED = "accepted"
+    """Durable, not yet planned."""
+    RUNNING = "running"
+    CANCELLING = "cancelling"
+    """Somebody asked to stop it; runs are being ended."""
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing will follow."""
+        return self in (TaskState.SUCCEEDED, TaskState.FAILED, TaskState.CANCELLED)
+
+
+class SubtaskState(StrEnum):
+    """Life of a subtask. The last three are final."""
+
+    WAITING = "waiting"
+    """Its predecessors have not all succeeded."""
+    READY = "ready"
+    """Could start now; waits for a place (robot, gateway, retry delay)."""
+    DISPATCHED = "dispatched"
+    """Attempt written to the record and sent to a gateway."""
+    RUNNING = "running"
+    """Its handler has run its first line."""
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing will follow."""
+        return self in (SubtaskState.SUCCEEDED, SubtaskState.FAILED, SubtaskState.CANCELLED)
+
+
+class Phase(StrEnum):
+    """Which phase of container selection served a subtask (paper, Algorithm 1)."""
+
+    LOCAL_WARM = "local warm"
+    REMOTE_WARM = "remote warm"
+    COLD = "cold"
+
+
+class Failure(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Why something did not work, as told to people; `retryable` when another attempt may succeed."""
+
+    code: str
+    message: str
+    remedy: str = ""
+    retryable: bool = False
+
+
+class Attempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One try at a subtask; `number` fences off late results of earlier tries."""
+
+    number: int
+    gateway: str
+    container: str = ""
+    phase: Phase | None = None
+    failure: Failure | None = None
+
+
+class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A subtask of the plan and what has become of it. `bound_robot` is the robot in place of `any`."""
+
+    subtask: Subtask
+    state: SubtaskState = SubtaskState.WAITING
+    bound_robot: str | None = None
+    gateway: str = ""
+    container: str = ""
+    phase: Phase | None = None
+    startup_ms: float | None = None
+    """Ready to the first line of the handler, on the coordinator's clock."""
+    duration_ms: float | None = None
+    """First line of the handler to its result."""
+    progress: float = 0.0
+    note: str = ""
+    """What it does or waits for just now."""
+    attempts: tuple[Attempt, ...] = ()
+    result: dict[str, Any] | None = None
+    failure: Failure | None = None
+
+    @property
+    def attempt(self) -> int:
+        """Number of the current attempt, 0 before the first."""
+        return self.attempts[-1].number if self.attempts else 0
+
+
+class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A task as it stands in the DHT under `task/{id}`; its version vector is kept beside it by the store."""
+
+    id: str
+    instruction: str
+    submitter: str = ""
+    state: TaskState = TaskState.ACCEPTED
+    plan: Plan | None = None
+    subtasks: tuple[SubtaskRecord, ...] = ()
+    failure: Failure | None = None
+    coordinator: str = ""
+    created_ns: int = 0
+    updated_ns: int = 0
+    sequence: int = 0
+    """Number of transitions applied so far."""
+
+    def of(self, subtask_id: str) -> SubtaskRecord:
+        """Return the record of one subtask; KeyError when the plan has none of that id."""
+        for record in self.subtasks:
+            if record.subtask.id == subtask_id:
+                return record
+        raise KeyError(subtask_id)
+
+
+class TaskRequest(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+    """A person's or robot's wish. `id` makes a repeated submission the same task; `plan` skips planning."""
+
+    instruction: str
+    id: str = ""
+    submitter: str = ""
+    plan: Plan | None = None
+
+
+# --- runs: one attempt of a subtask on one gateway ---------------------------------------------------------
+
+
+class Need(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a subtask asks of a container: T = (image, cpu, mem, volumes) of Algorithm 1."""
+
+    image: str
+    cpu: float = 0.5
+    memory_mb: int = 128
+    volumes: tuple[str, ...] = ()
+
+
+class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Order to run one attempt of a subtask; `inputs` are the results of the subtasks it comes after."""
+
+    task: str
+    subtask: str
+    attempt: int
+    skill: str
+    need: Need
+    robot: str | None = None
+    params: dict[str, Any] = field(default_factory=dict[str, Any])
+    inputs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
+    coordinator: str = ""
+    deadline_s: float = 120.0
+    hops: int = 0
+    """How often it was passed on to a gateway with a warm container; one is the most."""
+
+    @property
+    def run_id(self) -> str:
+        """`task/subtask/attempt`, unique in the fleet."""
+        return f"{self.task}/{self.subtask}/{self.attempt}"
+
+
+class RunAccepted(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Answer to a run order: where it runs. `why` is the selection's explanation."""
+
+    gateway: str
+    container: str
+    phase: Phase
+    why: str = ""
+
+
+class RunEventKind(StrEnum):
+    """What a run tells: `started`, any number of `progress`/`log`/`partial`, then `succeeded` or `failed`."""
+
+    STARTED = "started"
+    PROGRESS = "progress"
+    LOG = "log"
+    PARTIAL = "partial"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+
+
+class RunEvent(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """News of a run, published under the task's key and kept by the executing gateway until the task ends."""
+
+    task: str
+    subtask: str
+    attempt: int
+    kind: RunEventKind
+    gateway: str = ""
+    container: str = ""
+    phase: Phase | None = None
+    progress: float = 0.0
+    note: str = ""
+    result: dict[str, Any] | None = None
+    failure: Failure | None = None
+    startup_ms: float | None = None
+    """On `started`: request received to first line of the handler, on the executing gateway's clock."""
+    duration_ms: float | None = None
+
+
+# --- facts with one owner ----------------------------------------------------------------------------------
+
+
+class ContainerState(StrEnum):
+    """Life of a pooled container."""
+
+    STARTING = "starting"
+    READY = "ready"
+    RESERVED = "reserved"
+    BUSY = "busy"
+    DRAINING = "draining"
+    DEAD = "dead"
+
+
+class ContainerInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A pooled container, spoken for by the gateway that holds it."""
+
+    id: str
+    gateway: str
+    image: str
+    state: ContainerState
+    cpu: float = 1.0
+    memory_mb: int = 256
+    volumes: tuple[str, ...] = ()
+    compatible: tuple[str, ...] = ()
+    """Other images whose skills it can run as well (same base, requirements present)."""
+    runs: int = 0
+    run: str = ""
+    """Run id while busy."""
+    cold_ms: float | None = None
+    """What its own cold start took."""
+    since_ns: int = 0
+
+
+class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A gateway's own account of itself, pushed on change and every few seconds."""
+
+    id: str
+    fleet: str
+    version: str = ""
+    load: float = 0.0
+    """0 idle to 1 saturated: the larger of CPU and pool use."""
+    cpu_percent: float = 0.0
+    memory_mb: float = 0.0
+    """Resident memory of the daemon."""
+    capacity: int = 0
+    """Containers it may hold."""
+    containers: int = 0
+    ready: int = 0
+    running: int = 0
+    """Runs in progress."""
+    queue: int = 0
+    tasks: int = 0
+    """Tasks it coordinates that have not ended."""
+    draining: bool = False
+    limits_enforced: bool = True
+    """False where the kernel's cgroups do not let rootless containers be limited."""
+    pool_problem: str = ""
+    """Why the pool cannot start containers now; empty when it can."""
+    robots: tuple[str, ...] = ()
+    endpoints: tuple[str, ...] = ()
+    refused: dict[str, int] = field(default_factory=dict[str, int])
+    """Counters of bad input by kind, since start."""
+    started_ns: int = 0
+    pid: int = 0
+
+
+class Pose(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Where a robot is: metres east (x), north (y) and up (z) of the site's origin; heading in degrees from north."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    heading_deg: float = 0.0
+
+
+class RobotInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A robot as its speaker (a MAVLink gateway, or the Zenoh robot itself) describes it."""
+
+    id: str
+    kind: str
+    """`mavlink` or `zenoh`."""
+    gateway: str = ""
+    """The gateway it is attached to; empty for one that speaks Zenoh itself."""
+    uses: tuple[str, ...] = ()
+    """Actuators and sensors it has, in the catalogue's words: base, arm, camera, ..."""
+    verbs: tuple[str, ...] = ()
+    """Commands it answers on `robot/{id}/command`."""
+    flies: bool = False
+    pose: Pose | None = None
+    battery_percent: float | None = None
+    armed: bool = False
+    mode: str = ""
+    holding: str = ""
+    online: bool = True
+    note: str = ""
+
+
+class RobotCommand(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An order to a robot. Same `id`: same order, answered again with the same reply and not done twice.
+
+    `attempt` fences: a robot that has seen a higher attempt of `task`/`subtask` refuses a lower one.
+    """
+
+    id: str
+    verb: str
+    args: dict[str, Any] = field(default_factory=dict[str, Any])
+    task: str = ""
+    subtask: str = ""
+    attempt: int = 0
+
+
+class RobotReply(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What came of a command: `result` or `failure`; `blobs` are files such as pictures (name -> bytes)."""
+
+    id: str
+    result: dict[str, Any] = field(default_factory=dict[str, Any])
+    blobs: dict[str, bytes] = field(default_factory=dict[str, bytes])
+    failure: Failure | None = None
+
+
+class Notice(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A message to a person, by `notify` or by the appliance itself."""
+
+    id: str
+    to: str
+    text: str
+    task: str = ""
+    gateway: str = ""
+    at_ns: int = 0
+
+
+class LogLine(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One structured log line of a gateway or of a run."""
+
+    at_ns: int
+    level: str
+    source: str
+    event: str
+    fields: dict[str, Any] = field(default_factory=dict[str, Any])
+
+
+# --- the site: what names in instructions mean ------------------------------------------------------------
+
+
+class Place(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A named place in site coordinates, metres."""
+
+    x: float
+    y: float
+    z: float = 0.0
+    aliases: tuple[str, ...] = ()
+
+
+class Box(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An axis-aligned rectangle on the ground, metres: an obstacle or a forbidden area."""
+
+    name: str
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+
+class SiteObject(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A thing that the simulated world holds: colour name, size in metres, where it is at first."""
+
+    name: str
+    colour: str
+    at: str
+    size: float = 0.4
+
+
+class Site(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The map of a site: places by name (lower case), obstacles, forbidden areas, and its geographic origin."""
+
+    name: str = "site"
+    latitude_deg: float = 47.397742
+    longitude_deg: float = 8.545594
+    altitude_m: float = 488.0
+    places: dict[str, Place] = field(default_factory=dict[str, Place])
+    obstacles: tuple[Box, ...] = ()
+    forbidden: tuple[Box, ...] = ()
+    objects: tuple[SiteObject, ...] = ()
+    altitude_limit_m: float = 60.0
+    speed_limit_mps: float = 8.0
+
+    def find(self, name: str) -> Place | None:
+        """Return the place of that name or alias (case and articles ignored), or None."""
+        wanted = " ".join(word for word in name.lower().replace("_", " ").split() if word not in ("the", "a", "an"))
+        for key, place in self.places.items():
+            if wanted == key or wanted in place.aliases:
+                return place
+        return None
+
+
+# --- wire --------------------------------------------------------------------------------------------------
+
+
+class ErrorReply(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What an RPC answers when it cannot do what was asked; see `errors.from_code`."""
+
+    code: str
+    message: str
+    remedy: str = ""
+    problems: tuple[str, ...] = ()
+
+
+def encode(value: Any) -> bytes:
+    """Encode a struct as JSON."""
+    return msgspec.json.encode(value)

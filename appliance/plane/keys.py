@@ -1,0 +1,103 @@
+"""The key space: the one module that knows key names. `docs/keyspace.md` describes each of them.
+
+Everything is under `swiftbot/{fleet}/`, so fleets on one network never meet. `{gateway}`, `{robot}`, `{task}`
+are single chunks (`check_name`).
+"""
+
+import re
+
+from appliance.errors import PayloadError
+
+ROOT = "swiftbot"
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
+
+
+def check_name(name: str, what: str) -> str:
+    """Return `name` if it may be one chunk of a key; PayloadError otherwise."""
+    if not _NAME.fullmatch(name):
+        raise PayloadError(f"{what} {name[:80]!r} is not a valid name", remedy="use a-z, 0-9, '_', '.', '-'; at most 63")
+    return name
+
+
+class Keys:
+    """Key names of one fleet. Methods that take no name return the expression that matches all."""
+
+    def __init__(self, fleet: str) -> None:
+        self.fleet = check_name(fleet, "fleet")
+        self.root = f"{ROOT}/{fleet}"
+
+    def everything(self) -> str:
+        """Every key of the fleet; the recorder subscribes to it."""
+        return f"{self.root}/**"
+
+    # gateways
+    def alive(self, gateway: str = "*") -> str:
+        """Liveliness token of a gateway."""
+        return f"{self.root}/gw/{gateway}/alive"
+
+    def status(self, gateway: str = "*") -> str:
+        """Put: GatewayStatus."""
+        return f"{self.root}/gw/{gateway}/status"
+
+    def container(self, gateway: str = "*", container: str = "*") -> str:
+        """Put: ContainerInfo; delete when it is gone."""
+        return f"{self.root}/gw/{gateway}/pool/{container}"
+
+    def rpc(self, gateway: str, verb: str) -> str:
+        """Queryable: a request to one gateway, answered with the verb's reply or ErrorReply."""
+        return f"{self.root}/gw/{gateway}/rpc/{verb}"
+
+    def exchange(self, gateway: str = "*", verb: str = "*") -> str:
+        """Put by the answering gateway: what was asked over RPC and what was answered (queries are not subscribable)."""
+        return f"{self.root}/gw/{gateway}/exchange/{verb}"
+
+    def log(self, gateway: str = "*") -> str:
+        """Put: LogLine."""
+        return f"{self.root}/gw/{gateway}/log"
+
+    # tasks
+    def task(self, task: str = "*") -> str:
+        """Put by the coordinator on every change: TaskRecord."""
+        return f"{self.root}/task/{task}/record"
+
+    def transition(self, task: str = "*") -> str:
+        """Put by the coordinator: every input of the task's state machine, in order, for replay."""
+        return f"{self.root}/task/{task}/transition"
+
+    def run(self, task: str = "*", subtask: str = "*") -> str:
+        """Put by the executing gateway: RunEvent."""
+        return f"{self.root}/task/{task}/run/{subtask}"
+
+    # robots
+    def robot_alive(self, robot: str = "*") -> str:
+        """Liveliness token of a robot that speaks Zenoh, or of the MAVLink gateway for one that does not."""
+        return f"{self.root}/robot/{robot}/alive"
+
+    def robot(self, robot: str = "*") -> str:
+        """Put, a few times a second: RobotInfo."""
+        return f"{self.root}/robot/{robot}/state"
+
+    def command(self, robot: str) -> str:
+        """Queryable: RobotCommand in, RobotReply out."""
+        return f"{self.root}/robot/{robot}/command"
+
+    def commanded(self, robot: str = "*") -> str:
+        """Put by whoever answers commands: each RobotCommand as it is taken up."""
+        return f"{self.root}/robot/{robot}/commanded"
+
+    def camera(self, robot: str = "*") -> str:
+        """Put: each picture taken, as foxglove.CompressedImage JSON."""
+        return f"{self.root}/robot/{robot}/camera"
+
+    def mavlink(self, robot: str = "*", direction: str = "*") -> str:
+        """Put: each raw MAVLink frame; direction `rx` (from the vehicle) or `tx`."""
+        return f"{self.root}/robot/{robot}/mavlink/{direction}"
+
+    def intake(self, robot: str = "*") -> str:
+        """Put by a robot: TaskRequest."""
+        return f"{self.root}/robot/{robot}/task"
+
+    # people
+    def notice(self, to: str = "*") -> str:
+        """Put: Notice to a person."""
+        return f"{self.root}/notice/{to}"

@@ -1,0 +1,1 @@
+"""Warm containers on this gateway: Podman, the runner, selection, health."""

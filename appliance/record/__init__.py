@@ -1,0 +1,1 @@
+"""MCAP: recorder, rotation, recovery, reading back."""

@@ -1,0 +1,1 @@
+"""Task manager: the life of a task, placement, runs, recovery."""

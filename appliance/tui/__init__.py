@@ -1,0 +1,1 @@
+"""The terminal UI: a Zenoh client, nothing more."""
