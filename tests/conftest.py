@@ -1,0 +1,69 @@
+"""Fixtures that every test may use: the async backend, free ports, and the reference data beside the project.
+
+They exist so that tests need nothing from outside themselves: ports are asked of the kernel, never fixed, and a
+missing reference file is a failure that says how to get it, never a silent skip.
+"""
+
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+"""The project's root folder."""
+
+
+@pytest.fixture(scope="session")
+def anyio_backend() -> str:
+    """Run every async test on asyncio: the product runs on nothing else."""
+    return "asyncio"
+
+
+def _ask_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def free_ports() -> Callable[..., list[int]]:
+    """Return a function `free_ports(n, udp=False)`: n different loopback ports that are free just now."""
+
+    def ask(count: int, *, udp: bool = False) -> list[int]:
+        kind = socket.SOCK_DGRAM if udp else socket.SOCK_STREAM
+        ports: set[int] = set()
+        while len(ports) < count:
+            ports.add(_ask_port(kind))
+        return sorted(ports)
+
+    return ask
+
+
+@pytest.fixture
+def free_port() -> int:
+    """Return a loopback TCP port that is free just now."""
+    return _ask_port(socket.SOCK_STREAM)
+
+
+@pytest.fixture
+def free_udp_port() -> int:
+    """Return a loopback UDP port that is free just now."""
+    return _ask_port(socket.SOCK_DGRAM)
+
+
+@pytest.fixture(scope="session")
+def project_root() -> Path:
+    """Return the project's root folder."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Return the folder of reference data (`../shared`, or $SWIFTBOT_SHARED); the test fails where there is none."""
+    named = os.environ.get("SWIFTBOT_SHARED", "")
+    folder = Path(named) if named else ROOT.parent / "shared"
+    if not folder.is_dir():
+        pytest.fail(f"reference data not found at {folder}: put it beside the project, or set SWIFTBOT_SHARED to it")
+    return folder
