@@ -1,0 +1,84 @@
+"""What the task manager answers over RPC: the request and reply structs of its verbs.
+
+The command line, the terminal UI and other gateways speak through these alone; `docs/keyspace.md` lists the
+verbs. Requests refuse unknown fields, so that a typing error is an error and not a silent default.
+"""
+
+from msgspec import Struct
+
+from appliance.llm.settings import TierAttempt
+from appliance.model import ContainerInfo, Plan, RunEvent, TaskRecord
+
+
+class TaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`task` and `cancel`: which task."""
+
+    id: str
+
+
+class TasksAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`tasks`: how many at most, newest first. `local` asks for the records of the answering gateway's shard alone."""
+
+    limit: int = 100
+    local: bool = False
+
+
+class TaskList(Struct, frozen=True, kw_only=True):
+    """Task records, newest first; `unreachable` names gateways that did not answer in time."""
+
+    tasks: tuple[TaskRecord, ...]
+    unreachable: tuple[str, ...] = ()
+
+
+class PlanAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`plan`: decompose, run nothing."""
+
+    instruction: str
+
+
+class PlanAnswer(Struct, frozen=True, kw_only=True):
+    """A valid plan and what each tier that was asked made of the instruction."""
+
+    plan: Plan
+    attempts: tuple[TierAttempt, ...] = ()
+
+
+class RunAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`run_status` and `run_cancel`: which attempt of which subtask."""
+
+    task: str
+    subtask: str
+    attempt: int
+
+    @property
+    def run_id(self) -> str:
+        """`task/subtask/attempt`."""
+        return f"{self.task}/{self.subtask}/{self.attempt}"
+
+
+class RunStatus(Struct, frozen=True, kw_only=True):
+    """Whether a gateway runs that attempt now, and the last of its events that it keeps (`None`: never heard of it)."""
+
+    running: bool
+    last: RunEvent | None = None
+
+
+class ContainerList(Struct, frozen=True, kw_only=True):
+    """`find_containers`: ready containers that the asked gateway knows for a need, its own and others'."""
+
+    containers: tuple[ContainerInfo, ...]
+
+
+class ArtifactAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`artifact`: a piece of a stored file, by its SHA-256."""
+
+    artifact: str
+    offset: int = 0
+    length: int = 1 << 20
+
+
+class ArtifactPiece(Struct, frozen=True, kw_only=True):
+    """A piece of a stored file; `size` is that of the whole."""
+
+    data: bytes
+    size: int

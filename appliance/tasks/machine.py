@@ -1,0 +1,346 @@
+"""The life of a task as a pure state machine, so that the daemon, the tests and a log's replay run the same code.
+
+`apply` folds one `Transition` into a `TaskRecord`; it does no I/O, reads no clock and knows no configuration:
+all that a decision depended on stands in the transition (for instance `give_up`, the outcome of the retry
+policy). `actions` says what a record asks for next. The coordinator publishes each transition it applies, in
+order, so that folding the logged ones over nothing must give the record that was logged last.
+
+    accepted ──planned──► running ──all succeeded──► succeeded
+       │                     ├──an attempt given up──► cancelling ──runs ended──► failed
+       └──plan failed──►     └──cancel──► cancelling ──runs ended──► cancelled
+          failed
+
+A subtask: waiting → ready → dispatched → running → succeeded; an attempt that failed and may be repeated goes
+back to ready with the next attempt number; results of other attempts than the current one are stale.
+"""
+
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from appliance.errors import SwiftbotError
+from appliance.model import (
+    Attempt,
+    Failure,
+    Phase,
+    Plan,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+)
+
+
+class TransitionKind(StrEnum):
+    """What happened to a task."""
+
+    ACCEPTED = "accepted"
+    PLANNED = "planned"
+    PLAN_FAILED = "plan failed"
+    ADOPTED = "adopted"
+    """Another gateway now coordinates it (takeover)."""
+    DISPATCHED = "dispatched"
+    STARTED = "started"
+    PROGRESS = "progress"
+    SUCCEEDED = "succeeded"
+    ATTEMPT_FAILED = "attempt failed"
+    CANCEL = "cancel"
+
+
+class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One input of the state machine, as published under `task/{id}/transition`. `sequence` counts from 1."""
+
+    task: str
+    sequence: int
+    kind: TransitionKind
+    at_ns: int
+    coordinator: str
+    instruction: str = ""
+    submitter: str = ""
+    plan: Plan | None = None
+    subtask: str = ""
+    attempt: int = 0
+    robot: str | None = None
+    gateway: str = ""
+    container: str = ""
+    phase: Phase | None = None
+    startup_ms: float | None = None
+    duration_ms: float | None = None
+    progress: float = 0.0
+    note: str = ""
+    result: dict[str, Any] | None = None
+    failure: Failure | None = None
+    give_up: bool = False
+    """Of a failed attempt: no further one will be made."""
+
+
+class StaleTransition(SwiftbotError):
+    """The transition does not fit the record: an outdated attempt, a repeated event, a final task."""
+
+    code = "stale"
+
+
+def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
+    """Fold one transition into a record.
+
+    Args:
+        record: the task so far; None only for `accepted`.
+        event: what happened; its sequence must be the record's plus one.
+
+    Returns:
+        The record after it.
+
+    Raises:
+        StaleTransition: it does not fit; the record stands as it was.
+    """
+    if record is None:
+        if event.kind is not TransitionKind.ACCEPTED or event.sequence != 1:
+            raise StaleTransition(f"{event.kind} (sequence {event.sequence}) before the task was accepted")
+        return TaskRecord(
+            id=event.task,
+            instruction=event.instruction,
+            submitter=event.submitter,
+            coordinator=event.coordinator,
+            created_ns=event.at_ns,
+            updated_ns=event.at_ns,
+            sequence=1,
+        )
+    if event.task != record.id:
+        raise StaleTransition(f"transition of task {event.task} applied to {record.id}")
+    if event.sequence != record.sequence + 1:
+        raise StaleTransition(f"sequence {event.sequence} after {record.sequence}")
+    if record.state.final:
+        raise StaleTransition(f"task {record.id} has already {record.state}")
+    handler = _HANDLERS.get(event.kind)
+    if handler is None:
+        raise StaleTransition(f"{event.kind} of a task that was accepted before")
+    changed = _settle(handler(record, event))
+    return replace(changed, sequence=event.sequence, updated_ns=event.at_ns, coordinator=event.coordinator)
+
+
+def fits(record: TaskRecord, event: Transition) -> bool:
+    """Whether `apply` would take the transition."""
+    try:
+        apply(record, event)
+    except StaleTransition:
+        return False
+    return True
+
+
+def _planned(record: TaskRecord, event: Transition) -> TaskRecord:
+    if record.state is not TaskState.ACCEPTED or event.plan is None:
+        raise StaleTransition(f"a plan for task {record.id}, which is {record.state}")
+    subtasks = tuple(
+        SubtaskRecord(subtask=subtask, state=SubtaskState.WAITING if subtask.after else SubtaskState.READY)
+        for subtask in event.plan.subtasks
+    )
+    return replace(record, state=TaskState.RUNNING, plan=event.plan, subtasks=subtasks)
+
+
+def _plan_failed(record: TaskRecord, event: Transition) -> TaskRecord:
+    if record.state not in (TaskState.ACCEPTED, TaskState.CANCELLING):
+        raise StaleTransition(f"no plan for task {record.id}, which is {record.state}")
+    return replace(record, state=TaskState.FAILED, failure=event.failure)
+
+
+def _adopted(record: TaskRecord, event: Transition) -> TaskRecord:  # noqa: ARG001 - the coordinator is set for all
+    return record
+
+
+def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
+    target = _subtask(record, event)
+    if record.state is not TaskState.RUNNING or target.state is not SubtaskState.READY:
+        raise StaleTransition(f"dispatch of {event.subtask}, which is {target.state}")
+    if event.attempt != target.attempt + 1:
+        raise StaleTransition(f"attempt {event.attempt} of {event.subtask} after {target.attempt}")
+    return _with(
+        record,
+        replace(
+            target,
+            state=SubtaskState.DISPATCHED,
+            bound_robot=event.robot,
+            gateway=event.gateway,
+            container="",
+            phase=None,
+            startup_ms=None,
+            duration_ms=None,
+            progress=0.0,
+            note=event.note,
+            failure=None,
+            attempts=(*target.attempts, Attempt(number=event.attempt, gateway=event.gateway)),
+        ),
+    )
+
+
+def _started(record: TaskRecord, event: Transition) -> TaskRecord:
+    target = _current(record, event, SubtaskState.DISPATCHED)
+    attempt = replace(target.attempts[-1], gateway=event.gateway, container=event.container, phase=event.phase)
+    return _with(
+        record,
+        replace(
+            target,
+            state=SubtaskState.RUNNING,
+            gateway=event.gateway,
+            container=event.container,
+            phase=event.phase,
+            startup_ms=event.startup_ms,
+            note="",
+            attempts=(*target.attempts[:-1], attempt),
+        ),
+    )
+
+
+def _progress(record: TaskRecord, event: Transition) -> TaskRecord:
+    target = _subtask(record, event)
+    if target.state.final or event.attempt != target.attempt:
+        raise StaleTransition(f"progress of attempt {event.attempt} of {event.subtask}, which is {target.state}")
+    return _with(record, replace(target, progress=event.progress, note=event.note))
+
+
+def _succeeded(record: TaskRecord, event: Transition) -> TaskRecord:
+    # A run that ends at once can be heard of by its result first: dispatched is as good as running here.
+    target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+    done = replace(
+        target,
+        state=SubtaskState.SUCCEEDED,
+        progress=1.0,
+        note="",
+        result=event.result or {},
+        duration_ms=event.duration_ms,
+        gateway=event.gateway or target.gateway,
+        container=event.container or target.container,
+        phase=event.phase or target.phase,
+    )
+    return _with(record, done)
+
+
+def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
+    target = _subtask(record, event)
+    if event.failure is None:
+        raise StaleTransition("a failed attempt without a reason")
+    if target.state is SubtaskState.READY and event.attempt == target.attempt + 1 and event.give_up:
+        # Given up before it could be sent anywhere: nobody can run it.
+        attempts = target.attempts
+    else:
+        target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+        attempts = (*target.attempts[:-1], replace(target.attempts[-1], failure=event.failure))
+    ended = replace(target, attempts=attempts, failure=event.failure, duration_ms=event.duration_ms, note="")
+    if record.state is TaskState.CANCELLING:
+        return _with(record, replace(ended, state=SubtaskState.CANCELLED))
+    if not event.give_up:
+        return _with(record, replace(ended, state=SubtaskState.READY, note=f"repeats: {event.failure.message}"))
+    failure = replace(event.failure, message=f"{event.subtask} ({target.subtask.skill}): {event.failure.message}")
+    failed = _with(record, replace(ended, state=SubtaskState.FAILED))
+    return _stop_rest(replace(failed, state=TaskState.CANCELLING, failure=failure))
+
+
+def _cancel(record: TaskRecord, event: Transition) -> TaskRecord:
+    if record.state is TaskState.CANCELLING:
+        raise StaleTransition(f"task {record.id} is being cancelled already")
+    return _stop_rest(replace(record, state=TaskState.CANCELLING, failure=None))
+
+
+def _stop_rest(record: TaskRecord) -> TaskRecord:
+    """Cancel what has not been sent anywhere; runs in progress end by their own events."""
+    return replace(
+        record,
+        subtasks=tuple(
+            replace(each, state=SubtaskState.CANCELLED, note="")
+            if each.state in (SubtaskState.WAITING, SubtaskState.READY)
+            else each
+            for each in record.subtasks
+        ),
+    )
+
+
+def _settle(record: TaskRecord) -> TaskRecord:
+    """Draw what follows by itself: predecessors done makes ready, all done ends the task."""
+    if record.state is TaskState.RUNNING:
+        done = {each.subtask.id for each in record.subtasks if each.state is SubtaskState.SUCCEEDED}
+        subtasks = tuple(
+            replace(each, state=SubtaskState.READY)
+            if each.state is SubtaskState.WAITING and done.issuperset(each.subtask.after)
+            else each
+            for each in record.subtasks
+        )
+        state = TaskState.SUCCEEDED if len(done) == len(subtasks) else TaskState.RUNNING
+        return replace(record, subtasks=subtasks, state=state)
+    if record.state is TaskState.CANCELLING and all(each.state.final for each in record.subtasks):
+        return replace(record, state=TaskState.FAILED if record.failure else TaskState.CANCELLED)
+    return record
+
+
+def _subtask(record: TaskRecord, event: Transition) -> SubtaskRecord:
+    try:
+        return record.of(event.subtask)
+    except KeyError:
+        raise StaleTransition(f"task {record.id} has no subtask {event.subtask!r}") from None
+
+
+def _current(record: TaskRecord, event: Transition, *states: SubtaskState) -> SubtaskRecord:
+    target = _subtask(record, event)
+    if target.state not in states or event.attempt != target.attempt:
+        raise StaleTransition(
+            f"{event.kind} of attempt {event.attempt} of {event.subtask}, which is {target.state} at {target.attempt}"
+        )
+    return target
+
+
+def _with(record: TaskRecord, changed: SubtaskRecord) -> TaskRecord:
+    return replace(
+        record,
+        subtasks=tuple(changed if each.subtask.id == changed.subtask.id else each for each in record.subtasks),
+    )
+
+
+_HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] = {
+    TransitionKind.PLANNED: _planned,
+    TransitionKind.PLAN_FAILED: _plan_failed,
+    TransitionKind.ADOPTED: _adopted,
+    TransitionKind.DISPATCHED: _dispatched,
+    TransitionKind.STARTED: _started,
+    TransitionKind.PROGRESS: _progress,
+    TransitionKind.SUCCEEDED: _succeeded,
+    TransitionKind.ATTEMPT_FAILED: _attempt_failed,
+    TransitionKind.CANCEL: _cancel,
+}
+
+
+def ready(record: TaskRecord) -> tuple[SubtaskRecord, ...]:
+    """Subtasks that may be dispatched now."""
+    if record.state is not TaskState.RUNNING:
+        return ()
+    return tuple(each for each in record.subtasks if each.state is SubtaskState.READY)
+
+
+def active(record: TaskRecord) -> tuple[SubtaskRecord, ...]:
+    """Subtasks with a run somewhere."""
+    return tuple(each for each in record.subtasks if each.state in (SubtaskState.DISPATCHED, SubtaskState.RUNNING))
+
+
+def retry_delay_s(attempt: int) -> float:
+    """Pause before the attempt after this one, seconds: 0.2, 0.4, 0.8, ... up to 5."""
+    return min(5.0, 0.2 * 2 ** max(0, attempt - 1))
+
+
+def gives_up(target: SubtaskRecord, failure: Failure, *, retries: int) -> bool:
+    """Whether a failed attempt is the last: not worth repeating, or the skill's retries are used up.
+
+    An attempt that was lost with its gateway (`unreachable`) or refused by a full or draining one (`refused`)
+    says nothing about the subtask: those do not use up the skill's own retries but a bound of their own.
+    """
+    if not failure.retryable:
+        return True
+    own = [a for a in target.attempts if a.failure and a.failure.code not in _NOT_ITS_FAULT]
+    others = len(target.attempts) - len(own)
+    if failure.code in _NOT_ITS_FAULT:
+        return others >= MAX_DISPLACEMENTS
+    return len(own) >= retries
+
+
+_NOT_ITS_FAULT = ("unreachable", "refused", "pool")
+MAX_DISPLACEMENTS = 8
+"""Attempts lost to gateways before a subtask is given up: more than a fleet loses at once, yet bounded."""

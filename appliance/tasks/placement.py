@@ -1,0 +1,127 @@
+"""Coarse scheduling as a pure function: which gateway should a subtask be sent to, and why.
+
+score(gateway) = w_l · (1 − load) + w_d · proximity + w_w · warm (paper, two-level scheduling; `algorithms.md`),
+with proximity = share of the subtask's input files held there, or 1 where its robot's link is and there are no
+files, and warm = 1 if a ready container of the image is there, 0.5 for a compatible one. A gateway that is
+draining, cannot start containers and has none ready, or failed this subtask before while others remain, is no
+candidate. Ties go to the gateway that asks: it is a network hop nearer.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from msgspec import Struct
+
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, SubtaskRecord
+from appliance.tasks.settings import TasksConfig
+
+
+class Placement(Struct, frozen=True, kw_only=True):
+    """The gateways in order of preference, and a sentence for people on how that came about."""
+
+    order: tuple[str, ...]
+    why: str
+
+
+def place(
+    need: Need,
+    *,
+    here: str,
+    gateways: Mapping[str, GatewayStatus],
+    containers: Mapping[str, Mapping[str, ContainerInfo]],
+    holds: Mapping[str, float],
+    robot: RobotInfo | None,
+    avoid: frozenset[str],
+    config: TasksConfig,
+) -> Placement:
+    """Order the gateways a subtask could be sent to, best first.
+
+    Args:
+        need: what it asks of a container.
+        here: the asking gateway.
+        gateways: present gateways by id.
+        containers: their pooled containers by gateway and id.
+        holds: gateway -> share (0 to 1) of the input files it holds.
+        robot: the robot it commands, if any.
+        avoid: gateways where an attempt at it failed; used only when nothing else is left.
+        config: the weights.
+    """
+    scored: list[tuple[float, bool, str, str]] = []
+    reasons: list[str] = []
+    for gateway, status in gateways.items():
+        warm = _warm(need, containers.get(gateway, {}).values())
+        if status.draining:
+            reasons.append(f"{gateway} is draining")
+            continue
+        if status.pool_problem and not warm:
+            reasons.append(f"{gateway}: {status.pool_problem}")
+            continue
+        near = holds.get(gateway, 0.0)
+        if not holds and robot is not None:
+            near = float(robot.gateway == gateway)
+        score = (
+            config.load_weight * (1 - min(1.0, max(0.0, status.load)))
+            + config.data_weight * near
+            + config.warm_weight * warm
+        )
+        scored.append((score, gateway == here, gateway, f"{gateway} {score:.2f}"))
+    scored.sort(key=lambda row: (row[2] in avoid, -row[0], not row[1], row[2]))
+    if not scored:
+        return Placement(order=(), why="; ".join(reasons) or "no gateway is present")
+    return Placement(
+        order=tuple(row[2] for row in scored), why=", ".join([row[3] for row in scored] + reasons)
+    )
+
+
+def _warm(need: Need, containers: Iterable[ContainerInfo]) -> float:
+    best = 0.0
+    for container in containers:
+        if container.state is ContainerState.READY:
+            best = max(best, 1.0 if container.image == need.image else 0.5 * (need.image in container.compatible))
+    return best
+
+
+def bind(
+    label: str,
+    records: Sequence[SubtaskRecord],
+    *,
+    robots: Mapping[str, RobotInfo],
+    uses: Mapping[str, Sequence[str]],
+    verbs: Mapping[str, Sequence[str]],
+    busy: frozenset[str],
+) -> tuple[str | None, str]:
+    """Choose the robot behind `any`, `any1`, ... or confirm a named one.
+
+    Args:
+        label: the plan's robot.
+        records: all subtasks of the task (a label means one robot throughout).
+        robots: the roster.
+        uses: subtask id -> actuators it needs.
+        verbs: subtask id -> commands it needs.
+        busy: robots with a run in progress, chosen last; those of other labels of this task are not chosen.
+
+    Returns:
+        The robot and "", or None and the reason for the wait.
+    """
+    if not label.startswith("any"):
+        robot = robots.get(label)
+        if robot is None or not robot.online:
+            return None, f"waits for {label}: {'offline' if robot else 'not in the roster'}"
+        return label, ""
+    mine = [each for each in records if each.subtask.robot == label]
+    for each in mine:
+        if each.bound_robot:
+            return each.bound_robot, ""
+    taken = {each.bound_robot for each in records if each.bound_robot}
+    named = {each.subtask.robot for each in records if each.subtask.robot}
+    able = [
+        robot
+        for robot in robots.values()
+        if robot.online
+        and all(set(uses.get(each.subtask.id, ())) <= set(robot.uses) for each in mine)
+        and all(set(verbs.get(each.subtask.id, ())) <= set(robot.verbs) for each in mine)
+    ]
+    if not able:
+        wanted = sorted({use for each in mine for use in uses.get(each.subtask.id, ())})
+        return None, f"waits for a robot with {', '.join(wanted) or 'the needed skills'}"
+    able.sort(key=lambda robot: (robot.id in taken or robot.id in named, robot.id in busy, robot.id))
+    return able[0].id, ""

@@ -1,0 +1,28 @@
+"""Configuration of the task manager."""
+
+from msgspec import Struct
+
+
+class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Scheduling weights, bounds and deadlines."""
+
+    load_weight: float = 0.4
+    """Coarse score: weight of idle capacity."""
+    data_weight: float = 0.3
+    """Coarse score: weight of holding the inputs or the robot's link."""
+    warm_weight: float = 0.3
+    """Coarse score: weight of a ready container of the image."""
+    max_tasks: int = 200
+    """Unfinished tasks one gateway coordinates; further submissions are refused with the reason."""
+    max_instruction_chars: int = 2000
+    """Longer instructions are refused: no plain instruction is, and prompts must stay bounded."""
+    run_timeout_s: float = 3.0
+    """How long a gateway may take to accept a run before another is tried."""
+    check_s: float = 2.0
+    """How often runs in progress are checked against their gateway, in case an event was lost."""
+    grace_s: float = 10.0
+    """How long after its deadline, or after a cancel, a silent run is given up."""
+    max_artifact_mb: int = 64
+    """Largest file a handler may store."""
+    keep_finished: int = 500
+    """Finished task records kept in this gateway's shard."""
