@@ -101,3 +101,20 @@ class Keys:
     def notice(self, to: str = "*") -> str:
         """Put: Notice to a person."""
         return f"{self.root}/notice/{to}"
+
+    # recorders
+    def recorder_status(self, recorder: str = "*") -> str:
+        """Put every second: RecorderStatus."""
+        return f"{self.root}/recorder/{recorder}/status"
+
+    def recorder_gap(self, recorder: str) -> str:
+        """Only in logs, never put: Gap, the messages that are missing there."""
+        return f"{self.root}/recorder/{recorder}/gap"
+
+    def recorder_deleted(self, recorder: str) -> str:
+        """Only in logs, never put: Deletion of a key."""
+        return f"{self.root}/recorder/{recorder}/deleted"
+
+    def recorder_log(self, recorder: str) -> str:
+        """Only in logs, never put: log lines and notices as foxglove.Log."""
+        return f"{self.root}/recorder/{recorder}/log"
