@@ -103,6 +103,7 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
             id=event.task,
             instruction=event.instruction,
             submitter=event.submitter,
+            plan=event.plan,
             coordinator=event.coordinator,
             created_ns=event.at_ns,
             updated_ns=event.at_ns,

@@ -1,0 +1,141 @@
+"""What a handler may ask of the appliance while it runs: robot commands, notices, files.
+
+Every effect has the id `task/subtask/n`, n being the number of the call within the handler, the same in a
+repeated attempt; whoever carries it out does it once per id. So a gateway that dies between doing and
+telling never doubles an effect.
+"""
+
+import asyncio
+import base64
+import time
+from collections.abc import Callable
+from typing import Any, cast
+
+import msgspec
+import structlog
+from msgspec import Struct
+
+from appliance.errors import ConflictError, PayloadError, RobotError, SwiftbotError, from_code
+from appliance.model import Notice, RobotCommand, RobotReply, encode
+from appliance.plane.keys import check_name
+from appliance.plane.node import Plane
+from appliance.pool.pool import Call
+from appliance.robots.commands import send_command
+from appliance.tasks.api import ArtifactAsk, ArtifactPiece
+from appliance.tasks.artifacts import Artifacts
+
+log = structlog.get_logger(__name__)
+
+BUSY_RETRY_S = 0.5
+"""Pause before a busy robot is asked again."""
+
+
+class Calls:
+    """Carries out handlers' calls on one gateway."""
+
+    def __init__(self, plane: Plane, artifacts: Artifacts, *, on_wait: Callable[[Call, str], None]) -> None:
+        self._plane = plane
+        self._artifacts = artifacts
+        self._on_wait = on_wait
+
+    async def __call__(self, call: Call) -> dict[str, Any]:
+        """Carry out one call and return its answer; a SwiftbotError is the handler's to see."""
+        match call.name:
+            case "command":
+                return await self._command(call)
+            case "notify":
+                return await self._notify(call)
+            case "put_artifact":
+                return await self._put(call)
+            case "get_artifact":
+                return await self._get(call)
+            case _:
+                raise PayloadError(f"a handler asked for {call.name[:40]!r}, which the appliance does not offer")
+
+    async def _command(self, call: Call) -> dict[str, Any]:
+        run = call.run
+        if run.robot is None:
+            raise PayloadError(f"{run.skill} commands a robot but its subtask names none")
+        verb = str(call.args.get("verb", ""))
+        args = cast("dict[str, Any]", call.args.get("args") or {})
+        timeout_s = float(call.args.get("timeout_s", 60.0))
+        command = RobotCommand(
+            id=_effect(call), verb=verb, args=args, task=run.task, subtask=run.subtask, attempt=run.attempt
+        )
+        give_up = time.monotonic() + timeout_s
+        while True:
+            left = give_up - time.monotonic()
+            reply = await send_command(self._plane.session, run.robot, command, timeout_s=max(0.1, left))
+            if reply.failure is None:
+                return _answer(reply)
+            if reply.failure.code != "busy" or left <= BUSY_RETRY_S:
+                error = from_code(reply.failure.code, reply.failure.message, reply.failure.remedy)
+                if type(error) is SwiftbotError:
+                    error = RobotError(reply.failure.message, remedy=reply.failure.remedy)
+                raise error
+            self._on_wait(call, f"waits for {run.robot}: {reply.failure.message}")
+            await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _notify(self, call: Call) -> dict[str, Any]:
+        effect = _effect(call)
+        to = "".join(c if c.isalnum() or c in "_.-" else "_" for c in str(call.args.get("to", "operator")).lower())
+        key = f"effect/{effect}"
+        version = None
+        try:
+            version = await self._plane.dht.write(key, encode(_Effect(done=False)), expected=None)
+        except ConflictError:
+            record = await self._plane.dht.read(key)
+            if record is not None and msgspec.json.decode(record.value, type=_Effect).done:
+                return {"notice": effect, "repeated": True}
+            version = record.version if record else None
+        notice = Notice(
+            id=effect,
+            to=check_name(to.strip("_.-")[:60] or "operator", "recipient"),
+            text=str(call.args.get("text", ""))[:4000],
+            task=call.run.task,
+            gateway=self._plane.gateway,
+            at_ns=time.time_ns(),
+        )
+        self._plane.session.put(self._plane.keys.notice(notice.to), encode(notice))
+        try:
+            await self._plane.dht.write(key, encode(_Effect(done=True)), expected=version)
+        except ConflictError:
+            log.info("notice was settled by another attempt", effect=effect)
+        return {"notice": effect, "to": notice.to}
+
+    async def _put(self, call: Call) -> dict[str, Any]:
+        data = call.args.get("data", b"")
+        if isinstance(data, str):
+            try:
+                data = base64.b64decode(data, validate=True)
+            except ValueError as error:
+                raise PayloadError(f"the file's bytes are not base64: {error}") from error
+        reference = await self._artifacts.put(
+            str(call.args.get("name", "file")), data, str(call.args.get("media_type", "application/octet-stream"))
+        )
+        return cast("dict[str, Any]", msgspec.to_builtins(reference))
+
+    async def _get(self, call: Call) -> dict[str, Any]:
+        reference = call.args.get("ref")
+        if not isinstance(reference, dict):
+            raise PayloadError("get_artifact needs a reference from a result")
+
+        async def ask(member: str, piece: ArtifactAsk) -> ArtifactPiece:
+            return await self._plane.rpc.call(member, "artifact", piece, ArtifactPiece)
+
+        data = await self._artifacts.get(
+            cast("dict[str, Any]", reference), ask=ask, members=self._plane.members()
+        )
+        return {"data": data}
+
+
+class _Effect(Struct):
+    done: bool
+
+
+def _effect(call: Call) -> str:
+    return f"{call.run.task}/{call.run.subtask}/{call.number}"
+
+
+def _answer(reply: RobotReply) -> dict[str, Any]:
+    return {**reply.result, "blobs": reply.blobs} if reply.blobs else dict(reply.result)

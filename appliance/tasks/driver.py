@@ -1,0 +1,520 @@
+"""Drives one task from acceptance to its end: the thin shell around `machine`.
+
+One asyncio task a driver, with an inbox: run events, lost gateways, cancels and timers come in one at a time;
+each becomes a transition, the record is written to the DHT under compare-and-set *before* anything follows
+from it, then the orders go out. If the write finds that the record has moved on, another gateway coordinates
+the task: this driver reads again and, unless the key is its own, stops. So two coordinators never start the
+same attempt.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, Protocol
+
+import msgspec
+import structlog
+from msgspec import Struct
+
+from appliance.errors import ConflictError, PlanError, SwiftbotError
+from appliance.model import (
+    Failure,
+    Need,
+    Plan,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+    VersionVector,
+    encode,
+)
+from appliance.plane.node import Plane
+from appliance.skills.catalogue import SkillManifest
+from appliance.tasks import machine
+from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.placement import Placement
+from appliance.tasks.settings import TasksConfig
+
+log = structlog.get_logger(__name__)
+
+
+class Surroundings(Protocol):
+    """What a driver needs of its gateway; the coordinator provides it."""
+
+    plane: Plane
+    config: TasksConfig
+
+    async def plan(self, record: TaskRecord) -> Plan:
+        """Return a valid plan, the one handed in with the task or a new one; PlanError otherwise."""
+        ...
+
+    def manifest(self, skill: str) -> SkillManifest:
+        """Return a skill's manifest."""
+        ...
+
+    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
+        """Choose the robot of a subtask, or None with the reason for the wait."""
+        ...
+
+    def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
+        """Order the gateways for a subtask."""
+        ...
+
+    async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
+        """Send a run order, to this gateway without a detour."""
+        ...
+
+
+class RunNews(Struct, frozen=True):
+    """A run event came."""
+
+    event: RunEvent
+
+
+class GatewayLost(Struct, frozen=True):
+    """A gateway is gone."""
+
+    gateway: str
+
+
+class CancelAsked(Struct, frozen=True):
+    """Somebody wants it to stop."""
+
+    by: str = ""
+
+
+class Wake(Struct, frozen=True):
+    """Look again: a timer, a new robot, a new gateway."""
+
+
+Input = RunNews | GatewayLost | CancelAsked | Wake
+
+
+class Superseded(SwiftbotError):
+    """Another gateway coordinates the task now."""
+
+    code = "superseded"
+
+
+class Driver:
+    """Drives one task. `run` ends when the task has ended or another gateway has taken over."""
+
+    def __init__(
+        self,
+        around: Surroundings,
+        record: TaskRecord,
+        version: VersionVector,
+        *,
+        on_change: Callable[[TaskRecord], None],
+    ) -> None:
+        self._around = around
+        self._plane = around.plane
+        self.record = record
+        self._version = version
+        self._on_change = on_change
+        self._inbox: asyncio.Queue[Input] = asyncio.Queue()
+        self._ready_ns: dict[str, int] = {}
+        self._not_before: dict[str, float] = {}
+        self._sent_at: dict[str, float] = {}
+        self._waiting: dict[str, str] = {}
+        self._orders: set[asyncio.Task[object]] = set()
+        self._cancelled_at: float | None = None
+        self._pending: list[Transition] = []
+        self._outgoing: list[tuple[str, RunRequest]] = []
+        self._dirty = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether a subtask waits for a robot or a gateway."""
+        return bool(self._waiting)
+
+    def tell(self, news: Input) -> None:
+        """Hand in what happened; never blocks."""
+        self._inbox.put_nowait(news)
+
+    async def run(self) -> None:
+        """Drive to the end."""
+        try:
+            await self._resume()
+            while not self.record.state.final:
+                self._advance()
+                await self._flush()
+                if self.record.state.final:
+                    break
+                await self._handle(await self._next())
+                while not self._inbox.empty():
+                    await self._handle(self._inbox.get_nowait())
+            await self._flush()
+        except Superseded as error:
+            log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
+        finally:
+            for order in self._orders:
+                order.cancel()
+
+    async def _next(self) -> Input:
+        try:
+            return await asyncio.wait_for(self._inbox.get(), timeout=self._pause_s())
+        except TimeoutError:
+            return Wake()
+
+    def _pause_s(self) -> float:
+        now = time.monotonic()
+        due = [at - now for at in self._not_before.values() if at > now]
+        return max(0.01, min([self._around.config.check_s, *due]))
+
+    # --- taking up ------------------------------------------------------------------------------------------
+
+    async def _resume(self) -> None:
+        """Take the task over if another gateway coordinated it, ask after its runs, and plan it if need be."""
+        if self.record.sequence > 1 or self.record.coordinator != self._plane.gateway:
+            self._apply(self._transition(TransitionKind.ADOPTED))
+            await self._flush()
+        for each in machine.active(self.record):
+            await self._ask_after(each)
+        if self.record.state is TaskState.ACCEPTED:
+            planning = asyncio.ensure_future(self._around.plan(self.record))
+            cancelled = await self._planning(planning)
+            if cancelled:
+                planning.cancel()
+                self._apply(self._transition(TransitionKind.CANCEL))
+                return
+            try:
+                plan = planning.result()
+            except SwiftbotError as error:
+                self._apply(self._transition(TransitionKind.PLAN_FAILED, failure=_plan_failure(error)))
+                return
+            self._apply(self._transition(TransitionKind.PLANNED, plan=plan))
+
+    async def _planning(self, planning: "asyncio.Future[Plan]") -> bool:
+        """Wait for the plan; True if a cancel came first."""
+        while not planning.done():
+            asking = asyncio.ensure_future(self._inbox.get())
+            done, _ = await asyncio.wait({planning, asking}, return_when=asyncio.FIRST_COMPLETED)
+            if asking in done and isinstance(asking.result(), CancelAsked):
+                return True
+            if asking not in done:
+                asking.cancel()
+        return False
+
+    # --- what follows from the record ---------------------------------------------------------------------
+
+    def _advance(self) -> None:
+        """Dispatch what can be dispatched; on the way to the end, cancel what still runs."""
+        if self.record.state is TaskState.CANCELLING:
+            self._end_runs()
+            return
+        now = time.monotonic()
+        for each in machine.ready(self.record):
+            self._ready_ns.setdefault(each.subtask.id, time.monotonic_ns())
+            if self._not_before.get(each.subtask.id, 0.0) <= now:
+                self._not_before.pop(each.subtask.id, None)
+                self._dispatch(each)
+
+    def _dispatch(self, target: SubtaskRecord) -> None:
+        subtask = target.subtask
+        robot = None
+        if subtask.robot is not None:
+            robot, reason = self._around.bind(self.record, target)
+            if robot is None:
+                self._wait(target, reason)
+                return
+        placement = self._around.place(self.record, target, robot)
+        if not placement.order:
+            self._wait(target, f"waits for a gateway: {placement.why}")
+            return
+        self._waiting.pop(subtask.id, None)
+        attempt = target.attempt + 1
+        gateway = placement.order[0]
+        self._apply(
+            self._transition(
+                TransitionKind.DISPATCHED, subtask=subtask.id, attempt=attempt, gateway=gateway, robot=robot
+            )
+        )
+        manifest = self._around.manifest(subtask.skill)
+        request = RunRequest(
+            task=self.record.id,
+            subtask=subtask.id,
+            attempt=attempt,
+            skill=subtask.skill,
+            need=need_of(manifest),
+            robot=robot,
+            params=subtask.params,
+            inputs=self._inputs(target),
+            coordinator=self._plane.gateway,
+            deadline_s=deadline_s(manifest, subtask.params),
+        )
+        self._outgoing.append((gateway, request))
+
+    async def _send(self, gateway: str, request: RunRequest) -> None:
+        try:
+            await self._around.order(gateway, request)
+        except SwiftbotError as error:
+            failure = Failure(
+                code=error.code if error.code in ("refused", "pool") else "unreachable",
+                message=f"{gateway}: {error.message}",
+                remedy=error.remedy,
+                retryable=True,
+            )
+            self.tell(RunNews(_failed_event(request, gateway, failure)))
+
+    def _inputs(self, target: SubtaskRecord) -> dict[str, dict[str, Any]]:
+        """Results of the subtasks it comes after, directly or not: a report needs the picture two steps back."""
+        found: dict[str, dict[str, Any]] = {}
+        open_ids = list(target.subtask.after)
+        while open_ids:
+            before = self.record.of(open_ids.pop(0))
+            if before.subtask.id not in found:
+                found[before.subtask.id] = {"skill": before.subtask.skill, **(before.result or {})}
+                open_ids.extend(before.subtask.after)
+        return found
+
+    def _wait(self, target: SubtaskRecord, reason: str) -> None:
+        """Tell people why it waits, once per reason, and look again soon."""
+        self._not_before[target.subtask.id] = time.monotonic() + 0.5
+        if self._waiting.get(target.subtask.id) != reason:
+            self._waiting[target.subtask.id] = reason
+            self._apply(
+                self._transition(
+                    TransitionKind.PROGRESS, subtask=target.subtask.id, attempt=target.attempt, note=reason
+                ),
+                durable=False,
+            )
+
+    def _end_runs(self) -> None:
+        now = time.monotonic()
+        first = self._cancelled_at is None
+        if self._cancelled_at is None:
+            self._cancelled_at = now
+        for each in machine.active(self.record):
+            if now - self._cancelled_at > self._around.config.grace_s:
+                failure = Failure(code="cancelled", message=f"{each.gateway} did not confirm the cancel in time")
+                self._attempt_failed(each, failure, None)
+            elif first:
+                self._start(self._ask(each, "run_cancel"))
+
+    # --- what happened --------------------------------------------------------------------------------------
+
+    async def _handle(self, news: Input) -> None:
+        match news:
+            case RunNews(event):
+                self._run_news(event)
+            case GatewayLost(gateway):
+                for each in machine.active(self.record):
+                    if each.gateway == gateway:
+                        failure = Failure(code="unreachable", message=f"{gateway} was lost", retryable=True)
+                        self._attempt_failed(each, failure, None)
+            case CancelAsked():
+                if self.record.state is TaskState.RUNNING:
+                    self._apply(self._transition(TransitionKind.CANCEL))
+            case Wake():
+                for subtask in self._waiting:
+                    self._not_before.pop(subtask, None)
+                await self._check()
+
+    def _run_news(self, event: RunEvent) -> None:
+        try:
+            target = self.record.of(event.subtask)
+        except KeyError:
+            return
+        if event.attempt != target.attempt or target.state.final:
+            return
+        common: dict[str, Any] = {
+            "subtask": event.subtask,
+            "attempt": event.attempt,
+            "gateway": event.gateway,
+            "container": event.container,
+            "phase": event.phase,
+        }
+        match event.kind:
+            case RunEventKind.STARTED:
+                ready_ns = self._ready_ns.get(event.subtask)
+                startup_ms = (time.monotonic_ns() - ready_ns) / 1e6 if ready_ns else event.startup_ms
+                self._take(self._transition(TransitionKind.STARTED, startup_ms=startup_ms, **common))
+            case RunEventKind.PROGRESS:
+                self._take(
+                    self._transition(TransitionKind.PROGRESS, progress=event.progress, note=event.note, **common),
+                    durable=False,
+                )
+            case RunEventKind.SUCCEEDED:
+                self._take(
+                    self._transition(
+                        TransitionKind.SUCCEEDED, result=event.result, duration_ms=event.duration_ms, **common
+                    )
+                )
+            case RunEventKind.FAILED:
+                failure = event.failure or Failure(code="internal", message="the run failed without a reason")
+                self._attempt_failed(target, failure, event.duration_ms)
+            case RunEventKind.LOG | RunEventKind.PARTIAL:
+                pass
+
+    def _take(self, transition: Transition, *, durable: bool = True) -> None:
+        if machine.fits(self.record, transition):
+            self._apply(transition, durable=durable)
+
+    def _attempt_failed(self, target: SubtaskRecord, failure: Failure, duration_ms: float | None) -> None:
+        manifest = self._around.manifest(target.subtask.skill)
+        judged = _with_failure(target, failure)
+        give_up = machine.gives_up(judged, failure, retries=manifest.retries + 1)
+        self._take(
+            self._transition(
+                TransitionKind.ATTEMPT_FAILED,
+                subtask=target.subtask.id,
+                attempt=target.attempt,
+                gateway=target.gateway,
+                failure=failure,
+                give_up=give_up,
+                duration_ms=duration_ms,
+            )
+        )
+        self._ready_ns[target.subtask.id] = time.monotonic_ns()
+        if not give_up:
+            self._not_before[target.subtask.id] = time.monotonic() + machine.retry_delay_s(target.attempt)
+
+    async def _check(self) -> None:
+        """Ask after runs in case an event was lost, and give up those that are silent past their deadline."""
+        members = self._plane.members()
+        now = time.monotonic()
+        for each in machine.active(self.record):
+            if each.gateway not in members:
+                await self._handle(GatewayLost(each.gateway))
+                continue
+            limit = deadline_s(self._around.manifest(each.subtask.skill), each.subtask.params)
+            if now - self._sent_at.setdefault(each.subtask.id, now) > limit + self._around.config.grace_s:
+                failure = Failure(code="deadline", message=f"nothing came of it within {limit:.0f} s")
+                self._attempt_failed(each, failure, None)
+            elif now - self._sent_at[each.subtask.id] > self._around.config.check_s:
+                await self._ask_after(each)
+
+    async def _ask_after(self, target: SubtaskRecord) -> None:
+        """Learn from its gateway what became of a run."""
+        status = await self._ask(target, "run_status")
+        if status is None:
+            if target.gateway not in self._plane.members():
+                failure = Failure(code="unreachable", message=f"{target.gateway} was lost", retryable=True)
+                self._attempt_failed(target, failure, None)
+            return
+        if status.last is not None and (not status.running or status.last.kind is RunEventKind.STARTED):
+            self._run_news(status.last)
+        elif status.last is None:
+            sent = self._sent_at.get(target.subtask.id, 0.0)
+            if time.monotonic() - sent > self._around.config.run_timeout_s:
+                failure = Failure(
+                    code="unreachable", message=f"{target.gateway} does not know the run", retryable=True
+                )
+                self._attempt_failed(target, failure, None)
+
+    async def _ask(self, target: SubtaskRecord, verb: str) -> RunStatus | None:
+        ask = RunAsk(task=self.record.id, subtask=target.subtask.id, attempt=target.attempt)
+        try:
+            return await self._plane.rpc.call(target.gateway, verb, ask, RunStatus, timeout_s=2.0)
+        except SwiftbotError as error:
+            log.info("no word of a run", run=ask.run_id, gateway=target.gateway, reason=str(error))
+            return None
+
+    # --- the record ----------------------------------------------------------------------------------------
+
+    def _transition(self, kind: TransitionKind, **fields: Any) -> Transition:
+        return Transition(
+            task=self.record.id,
+            sequence=self.record.sequence + 1,
+            kind=kind,
+            at_ns=time.time_ns(),
+            coordinator=self._plane.gateway,
+            **fields,
+        )
+
+    def _apply(self, transition: Transition, *, durable: bool = True) -> None:
+        """Apply a transition in memory; `_flush` writes and publishes it before anything follows from it."""
+        before = {each.subtask.id for each in machine.ready(self.record)}
+        self.record = machine.apply(self.record, transition)
+        self._pending.append(transition)
+        self._dirty = self._dirty or durable
+        for each in machine.ready(self.record):
+            if each.subtask.id not in before:
+                self._ready_ns[each.subtask.id] = time.monotonic_ns()
+
+    async def _flush(self) -> None:
+        """Write the record, then publish what led to it and send the orders that follow; Superseded if it moved on.
+
+        One write covers all transitions since the last: a finished subtask and the dispatch of its successors
+        become durable together, which takes a replicated write off the successors' start.
+        """
+        if self._dirty:
+            try:
+                self._version = await self._plane.dht.write(
+                    task_key(self.record.id), encode(self.record), expected=self._version
+                )
+            except ConflictError:
+                await self._reread()
+            self._dirty = False
+        if not self._pending:
+            return
+        outgoing, self._outgoing = self._outgoing, []
+        for gateway, request in outgoing:
+            self._sent_at[request.subtask] = time.monotonic()
+            self._start(self._send(gateway, request))
+        for transition in self._pending:
+            self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
+        self._pending.clear()
+        self._plane.session.put(self._plane.keys.task(self.record.id), encode(self.record))
+        self._on_change(self.record)
+
+    def _start(self, order: Coroutine[Any, Any, object]) -> None:
+        task = asyncio.create_task(order)
+        self._orders.add(task)
+        task.add_done_callback(self._orders.discard)
+
+    async def _reread(self) -> None:
+        """The record has moved on: stop, and let the coordinator that owns the key read it anew."""
+        current = await self._plane.dht.read(task_key(self.record.id))
+        holder = ""
+        if current is not None:
+            holder = msgspec.json.decode(current.value, type=TaskRecord).coordinator
+        raise Superseded(f"the record has moved on to {holder or 'nobody'}")
+
+
+def task_key(task: str) -> str:
+    """Key of a task's record in the DHT."""
+    return f"task/{task}"
+
+
+def need_of(manifest: SkillManifest) -> Need:
+    """What a skill asks of a container."""
+    return Need(
+        image=manifest.image, cpu=manifest.cpu, memory_mb=manifest.memory_mb, volumes=manifest.volumes
+    )
+
+
+def deadline_s(manifest: SkillManifest, params: dict[str, Any]) -> float:
+    """Time a run may take: the skill's own, beyond the duration that was asked for."""
+    asked = params.get("duration_s", 0.0)
+    return manifest.timeout_s + (float(asked) if isinstance(asked, int | float) else 0.0)
+
+
+def _with_failure(target: SubtaskRecord, failure: Failure) -> SubtaskRecord:
+    if not target.attempts or target.state is SubtaskState.READY:
+        return target
+    last = msgspec.structs.replace(target.attempts[-1], failure=failure)
+    return msgspec.structs.replace(target, attempts=(*target.attempts[:-1], last))
+
+
+def _plan_failure(error: SwiftbotError) -> Failure:
+    problems = error.problems if isinstance(error, PlanError) else ()
+    message = error.message if not problems else f"{error.message}: {'; '.join(problems[:5])}"
+    return Failure(code=error.code, message=message, remedy=error.remedy)
+
+
+def _failed_event(request: RunRequest, gateway: str, failure: Failure) -> RunEvent:
+    return RunEvent(
+        task=request.task,
+        subtask=request.subtask,
+        attempt=request.attempt,
+        kind=RunEventKind.FAILED,
+        gateway=gateway,
+        failure=failure,
+    )

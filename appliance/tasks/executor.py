@@ -1,0 +1,216 @@
+"""Runs attempts of subtasks on this gateway: selection, start, events, and what is known of past runs.
+
+It knows nothing of plans. It accepts an order, answers where it will run, and publishes what becomes of it
+under the task's key; the last event of each run is kept in SQLite until the task's record has moved on, so a
+coordinator that comes later can ask.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import msgspec
+import structlog
+from msgspec.structs import replace
+
+from appliance.errors import RefusedError, SwiftbotError
+from appliance.model import (
+    Failure,
+    Phase,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
+    encode,
+)
+from appliance.plane.node import Plane
+from appliance.pool.pool import Call, Pool
+from appliance.pool.selection import Decision
+from appliance.tasks.api import RunAsk, RunStatus
+
+log = structlog.get_logger(__name__)
+
+KEPT_RUNS = 2000
+"""Last events kept of ended runs; a coordinator asks within seconds."""
+
+
+class Executor:
+    """The runs of one gateway."""
+
+    def __init__(self, plane: Plane, pool: Pool) -> None:
+        self._plane = plane
+        self._pool = pool
+        self._running: dict[str, asyncio.Task[None]] = {}
+        self._accepted: dict[str, RunAccepted] = {}
+        self._last: dict[str, RunEvent] = {}
+        self._attempts: dict[tuple[str, str], int] = {}
+        self.draining = False
+        self.on_change: Callable[[], None] = lambda: None
+
+    @property
+    def running(self) -> int:
+        """Runs in progress."""
+        return len(self._running)
+
+    async def start(self) -> None:
+        """Load what was kept; a run that was in progress when the gateway went down has failed."""
+        for key, value in await self._plane.store.scan("run/"):
+            event = msgspec.json.decode(value, type=RunEvent)
+            run_id = key.removeprefix("run/")
+            if event.kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+                event = replace(
+                    event,
+                    kind=RunEventKind.FAILED,
+                    failure=Failure(
+                        code="unreachable",
+                        message=f"{self._plane.gateway} was restarted while it ran",
+                        retryable=True,
+                    ),
+                )
+                await self._plane.store.put(key, encode(event))
+            self._remember(run_id, event)
+
+    async def run(self, request: RunRequest) -> RunAccepted:
+        """Accept one attempt and start it; the answer tells where, the events what becomes of it.
+
+        Raises:
+            RefusedError: the gateway drains, the attempt is outdated, or no container can be had.
+            PoolError: no container can be started now.
+        """
+        run_id = request.run_id
+        if run_id in self._accepted:
+            return self._accepted[run_id]
+        newest = self._attempts.get((request.task, request.subtask), 0)
+        if request.attempt < newest:
+            raise RefusedError(f"attempt {request.attempt} of {request.subtask} is outdated by attempt {newest}")
+        if self.draining:
+            raise RefusedError(f"{self._plane.gateway} is draining", remedy="another gateway takes it")
+        self._attempts[(request.task, request.subtask)] = request.attempt
+        received_ns = time.monotonic_ns()
+        decision = await self._pool.select(request.need, allow_remote=request.hops == 0)
+        if decision.phase is Phase.REMOTE_WARM:
+            try:
+                return await self._plane.rpc.call(
+                    decision.gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=2.0
+                )
+            except SwiftbotError as error:
+                # The container was taken or its gateway went away meanwhile: what is left is here.
+                log.info("remote container lost", run=run_id, gateway=decision.gateway, reason=str(error))
+                decision = await self._pool.select(request.need, allow_remote=False)
+        if request.hops and decision.phase is Phase.COLD:
+            raise RefusedError(f"{self._plane.gateway} has no ready container of {request.need.image} any more")
+        phase = Phase.REMOTE_WARM if request.hops else decision.phase
+        accepted = RunAccepted(
+            gateway=self._plane.gateway, container=decision.container or "", phase=phase, why=decision.why
+        )
+        self._accepted[run_id] = accepted
+        begun = RunEvent(
+            task=request.task,
+            subtask=request.subtask,
+            attempt=request.attempt,
+            kind=RunEventKind.PROGRESS,
+            gateway=self._plane.gateway,
+            phase=phase,
+        )
+        self._remember(run_id, begun)
+        task = asyncio.create_task(self._carry_out(request, decision, phase, received_ns), name=f"run {run_id}")
+        self._running[run_id] = task
+        task.add_done_callback(lambda _: self._ended(run_id))
+        self.on_change()
+        return accepted
+
+    async def _carry_out(self, request: RunRequest, decision: Decision, phase: Phase, received_ns: int) -> None:
+        run_id = request.run_id
+        waited_ms = (time.monotonic_ns() - received_ns) / 1e6
+
+        def tell(event: RunEvent) -> None:
+            told = replace(event, gateway=self._plane.gateway, phase=phase)
+            if told.kind is RunEventKind.STARTED and told.startup_ms is not None:
+                told = replace(told, startup_ms=told.startup_ms + waited_ms)
+            if told.kind is RunEventKind.STARTED:
+                self._last[run_id] = told
+            self._publish(told)
+
+        begun = asyncio.create_task(self._plane.store.put(f"run/{run_id}", encode(self._last[run_id])))
+        try:
+            final = await self._pool.run(request, decision, tell)
+        except SwiftbotError as error:
+            final = _failed(request, Failure(code=error.code, message=error.message, remedy=error.remedy, retryable=True))
+        except Exception as error:  # noqa: BLE001 - supervision boundary: a run must end with an event, whatever broke
+            log.exception("run broke", run=run_id)
+            final = _failed(request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True))
+        final = replace(final, gateway=self._plane.gateway, phase=phase)
+        self._remember(run_id, final)
+        await begun
+        # Kept before it is told: a coordinator that misses the event finds it here.
+        await self._plane.store.put(f"run/{run_id}", encode(final))
+        self._publish(final)
+
+    def _publish(self, event: RunEvent) -> None:
+        self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event))
+
+    def waits(self, call: Call, note: str) -> None:
+        """Tell that a run waits for something, as its progress."""
+        run = call.run
+        last = self._last.get(run.run_id)
+        self._publish(
+            RunEvent(
+                task=run.task,
+                subtask=run.subtask,
+                attempt=run.attempt,
+                kind=RunEventKind.PROGRESS,
+                gateway=self._plane.gateway,
+                progress=last.progress if last else 0.0,
+                note=note,
+            )
+        )
+
+    def _remember(self, run_id: str, event: RunEvent) -> None:
+        self._last[run_id] = event
+        key = (event.task, event.subtask)
+        self._attempts[key] = max(event.attempt, self._attempts.get(key, 0))
+        while len(self._last) > KEPT_RUNS:
+            oldest = next(each for each in self._last if each not in self._running)
+            gone = self._last.pop(oldest)
+            self._accepted.pop(oldest, None)
+            self._attempts.pop((gone.task, gone.subtask), None)
+            self._forget_later(oldest)
+
+    def _forget_later(self, run_id: str) -> None:
+        forgetting = asyncio.ensure_future(self._plane.store.delete(f"run/{run_id}"))
+        forgetting.add_done_callback(lambda done: done.exception())
+
+    def _ended(self, run_id: str) -> None:
+        self._running.pop(run_id, None)
+        self.on_change()
+
+    async def status(self, ask: RunAsk) -> RunStatus:
+        """Tell what is known of a run."""
+        return RunStatus(running=ask.run_id in self._running, last=self._last.get(ask.run_id))
+
+    async def cancel(self, ask: RunAsk) -> RunStatus:
+        """Ask a run to end; its final event follows."""
+        if ask.run_id in self._running:
+            await self._pool.cancel(ask.run_id)
+        return await self.status(ask)
+
+    async def drain(self, deadline_s: float) -> None:
+        """Accept nothing more and wait for the runs in progress; what is left then is cancelled."""
+        self.draining = True
+        self.on_change()
+        if self._running:
+            await asyncio.wait(list(self._running.values()), timeout=deadline_s)
+        for run_id in list(self._running):
+            await self._pool.cancel(run_id)
+        if self._running:
+            await asyncio.wait(list(self._running.values()), timeout=5.0)
+
+
+def _failed(request: RunRequest, failure: Failure) -> RunEvent:
+    return RunEvent(
+        task=request.task,
+        subtask=request.subtask,
+        attempt=request.attempt,
+        kind=RunEventKind.FAILED,
+        failure=failure,
+    )

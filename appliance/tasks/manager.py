@@ -1,0 +1,416 @@
+"""The task manager of one gateway: accepts tasks, drives those whose key it owns, answers for them over RPC.
+
+A task belongs to the gateway that owns `task/{id}` on the ring. Submissions are handed there, and acknowledged
+when the record is durable on it and on its replicas. When the ring changes, every gateway looks through its
+shard: an unfinished task whose key it now owns gets a driver here, one that it owns no longer loses it. That is
+all there is to takeover: a dead coordinator's tasks are driven by the next owner from the replicated record.
+"""
+
+import asyncio
+import contextlib
+import time
+import uuid
+from collections.abc import Callable
+
+import msgspec
+import structlog
+from msgspec.structs import replace
+
+from appliance.errors import (
+    ConflictError,
+    DeadlineError,
+    NotFoundError,
+    PayloadError,
+    PlanError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+)
+from appliance.llm.cascade import Decomposer
+from appliance.llm.settings import PlanContext
+from appliance.llm.validate import validate
+from appliance.model import (
+    Plan,
+    RunAccepted,
+    RunEvent,
+    RunRequest,
+    Site,
+    SubtaskRecord,
+    TaskRecord,
+    TaskRequest,
+    VersionVector,
+    encode,
+)
+from appliance.plane.keys import check_name
+from appliance.plane.node import Plane
+from appliance.skills.catalogue import Catalogue, SkillManifest
+from appliance.tasks import machine, resolve
+from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.driver import CancelAsked, Driver, GatewayLost, RunNews, Wake, need_of, task_key
+from appliance.tasks.executor import Executor
+from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.placement import Placement, bind, place
+from appliance.tasks.settings import TasksConfig
+
+log = structlog.get_logger(__name__)
+
+
+class TaskManager:
+    """Accepts, drives and answers for tasks on one gateway."""
+
+    def __init__(
+        self,
+        config: TasksConfig,
+        *,
+        plane: Plane,
+        catalogue: Catalogue,
+        decomposer: Decomposer,
+        executor: Executor,
+        site: Site,
+    ) -> None:
+        self.config = config
+        self.plane = plane
+        self._catalogue = catalogue
+        self._decomposer = decomposer
+        self._executor = executor
+        self._site = site
+        self._drivers: dict[str, Driver] = {}
+        self._driving: dict[str, asyncio.Task[None]] = {}
+        self._closers: list[Callable[[], None]] = []
+        self._stopping = False
+        self._sweep = asyncio.Event()
+        self._sweeper: asyncio.Task[None] | None = None
+        self.on_change: Callable[[], None] = lambda: None
+
+    @property
+    def unfinished(self) -> int:
+        """Tasks coordinated here that have not ended."""
+        return len(self._drivers)
+
+    async def start(self) -> None:
+        """Answer RPC and take up the unfinished tasks whose keys this gateway owns."""
+        rpc = self.plane.rpc
+        self.plane.dht.resolver = resolve.resolver
+        rpc.register("submit", TaskRequest, self.submit)
+        rpc.register("accept", TaskRequest, self.accept)
+        rpc.register("plan", PlanAsk, self.plan_only)
+        rpc.register("task", TaskAsk, self.task)
+        rpc.register("tasks", TasksAsk, self.tasks)
+        rpc.register("cancel", TaskAsk, self.cancel)
+        rpc.register("cancel_here", TaskAsk, self.cancel_here)
+        news = self.plane.session.subscribe_typed(self.plane.keys.run(), RunEvent, self._on_run_event)
+        self._closers.append(news.close)
+        self.plane.on_member_lost.append(self._on_member_lost)
+        self.plane.dht.on_ring_change.append(self._sweep.set)
+        self.plane.registry.on_change.append(self._on_fact)
+        self._sweeper = asyncio.create_task(self._keep_sweeping(), name="task takeover")
+        self._sweep.set()
+
+    async def stop(self) -> None:
+        """Stop driving; the records stay, and the next owner of each key goes on."""
+        self._stopping = True
+        for close in self._closers:
+            close()
+        tasks = [each for each in (self._sweeper, *self._driving.values()) if each]
+        for each in tasks:
+            each.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    # --- submission -----------------------------------------------------------------------------------------
+
+    async def submit(self, request: TaskRequest) -> TaskRecord:
+        """Accept a task wherever its key belongs; durable when this returns.
+
+        A request with an `id` that is known is the same task: its record is returned.
+
+        Raises:
+            PayloadError: empty or oversize instruction, bad id.
+            RefusedError: the coordinator is full.
+            UnreachableError: no owner could be reached within the time allowed.
+        """
+        request = self._checked(request)
+        until = time.monotonic() + 5.0
+        while True:
+            owner = self.plane.ring.owner(task_key(request.id))
+            if owner == self.plane.gateway:
+                return await self.accept(request)
+            try:
+                return await self.plane.rpc.call(owner, "accept", request, TaskRecord, timeout_s=2.0)
+            except (UnreachableError, DeadlineError) as error:
+                # The owner died: its tokens go within a second, then the ring names its successor.
+                if time.monotonic() > until:
+                    raise
+                log.info("owner did not answer, asking again", owner=owner, reason=str(error))
+                await asyncio.sleep(0.1)
+
+    def _checked(self, request: TaskRequest) -> TaskRequest:
+        instruction = request.instruction.strip()
+        if not instruction:
+            raise PayloadError("the instruction is empty", remedy="say what is to be done")
+        if len(instruction) > self.config.max_instruction_chars:
+            raise PayloadError(
+                f"the instruction has {len(instruction):,} characters, more than {self.config.max_instruction_chars:,}",
+                remedy="split it, or raise tasks.max_instruction_chars",
+            )
+        task = request.id or f"t-{uuid.uuid4().hex[:10]}"
+        return replace(request, instruction=instruction, id=check_name(task, "task"))
+
+    async def accept(self, request: TaskRequest) -> TaskRecord:
+        """Write the record, here and on the replicas, then drive it."""
+        request = self._checked(request)
+        if len(self._drivers) >= self.config.max_tasks:
+            raise RefusedError(
+                f"{self.plane.gateway} already coordinates {len(self._drivers)} unfinished tasks",
+                remedy="wait for some to end, or cancel some",
+            )
+        transition = Transition(
+            task=request.id,
+            sequence=1,
+            kind=TransitionKind.ACCEPTED,
+            at_ns=time.time_ns(),
+            coordinator=self.plane.gateway,
+            instruction=request.instruction,
+            submitter=request.submitter,
+            plan=request.plan,
+        )
+        record = machine.apply(None, transition)
+        try:
+            version = await self.plane.dht.write(task_key(record.id), encode(record), expected=None)
+        except ConflictError:
+            return await self.task(TaskAsk(id=request.id))
+        self.plane.session.put(self.plane.keys.transition(record.id), encode(transition))
+        self.plane.session.put(self.plane.keys.task(record.id), encode(record))
+        log.info("task accepted", task=record.id, instruction=record.instruction)
+        self._drive(record, version)
+        return record
+
+    # --- driving --------------------------------------------------------------------------------------------
+
+    def _drive(self, record: TaskRecord, version: VersionVector) -> None:
+        if record.id in self._drivers or self._stopping:
+            return
+        driver = Driver(self, record, version, on_change=lambda _: self.on_change())
+        self._drivers[record.id] = driver
+        task = asyncio.create_task(driver.run(), name=f"drive {record.id}")
+        self._driving[record.id] = task
+        task.add_done_callback(lambda done: self._driven(driver, done))
+        self.on_change()
+
+    def _driven(self, driver: Driver, done: asyncio.Task[None]) -> None:
+        self._drivers.pop(driver.record.id, None)
+        self._driving.pop(driver.record.id, None)
+        if not done.cancelled() and (error := done.exception()) is not None:
+            # The record stands as it was last written: a new driver takes it up from there.
+            log.error("driver broke", task=driver.record.id, exc_info=error)
+        if not driver.record.state.final and not self._stopping:
+            asyncio.get_running_loop().call_later(0.5, self._sweep.set)
+        else:
+            log.info("task ended", task=driver.record.id, state=str(driver.record.state))
+        self.on_change()
+
+    async def _keep_sweeping(self) -> None:
+        while True:
+            await self._sweep.wait()
+            self._sweep.clear()
+            try:
+                await self._take_up()
+            except SwiftbotError as error:
+                log.warning("takeover is tried again", reason=str(error))
+                asyncio.get_running_loop().call_later(1.0, self._sweep.set)
+
+    async def _take_up(self) -> None:
+        """Drive the unfinished tasks of the shard that are owned here; let go of those that are not."""
+        for task_id, driving in list(self._driving.items()):
+            if not self.plane.dht.owns(task_key(task_id)):
+                driving.cancel()
+        finished: list[tuple[int, str, VersionVector]] = []
+        for stored in await self.plane.dht.local("task/"):
+            if stored.deleted or not self.plane.dht.owns(stored.key):
+                continue
+            try:
+                record = msgspec.json.decode(stored.value, type=TaskRecord)
+            except msgspec.DecodeError as error:
+                log.error("task record cannot be read", key=stored.key, reason=str(error))
+                continue
+            if record.state.final:
+                finished.append((record.updated_ns, stored.key, stored.version))
+            elif record.id not in self._drivers:
+                self._drive(record, stored.version)
+        finished.sort()
+        for _, key, version in finished[: max(0, len(finished) - self.config.keep_finished)]:
+            with contextlib.suppress(ConflictError):
+                await self.plane.dht.remove(key, expected=version)
+
+    def _on_run_event(self, key: str, event: RunEvent | None) -> None:  # noqa: ARG002 - the event names its run
+        if event is not None and (driver := self._drivers.get(event.task)):
+            driver.tell(RunNews(event))
+
+    def _on_member_lost(self, gateway: str) -> None:
+        for driver in self._drivers.values():
+            driver.tell(GatewayLost(gateway))
+
+    def _on_fact(self, kind: str) -> None:
+        if kind == "robot":
+            for driver in self._drivers.values():
+                if driver.waits:
+                    driver.tell(Wake())
+
+    # --- what drivers need ------------------------------------------------------------------------------------
+
+    async def plan(self, record: TaskRecord) -> Plan:
+        """Return the plan handed in with the task if it is valid, else a new one."""
+        robots = tuple(self.plane.registry.robots.values())
+        if record.plan is not None:
+            problems = validate(
+                record.plan, self._catalogue, robots=robots, site=self._site, require_implemented=True
+            )
+            if problems:
+                raise PlanError("the plan handed in is not valid", problems=problems)
+            return record.plan
+        return (await self.plan_only(PlanAsk(instruction=record.instruction))).plan
+
+    async def plan_only(self, ask: PlanAsk) -> PlanAnswer:
+        """Decompose an instruction against the present roster and site; run nothing."""
+        instruction = self._checked(TaskRequest(instruction=ask.instruction)).instruction
+        robots = tuple(sorted(self.plane.registry.robots.values(), key=lambda robot: robot.id))
+        outcome = await self._decomposer.plan(
+            PlanContext(instruction=instruction, robots=robots, site=self._site)
+        )
+        return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts)
+
+    def manifest(self, skill: str) -> SkillManifest:
+        """Return a skill's manifest; the validator has made sure that it is there."""
+        return self._catalogue.skills[skill]
+
+    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
+        """Choose the robot of a subtask."""
+        manifests = {each.subtask.id: self.manifest(each.subtask.skill) for each in record.subtasks}
+        return bind(
+            target.subtask.robot or "",
+            record.subtasks,
+            robots=self.plane.registry.robots,
+            uses={key: manifest.uses for key, manifest in manifests.items()},
+            verbs={key: manifest.verbs for key, manifest in manifests.items()},
+            busy=self._busy_robots(),
+        )
+
+    def _busy_robots(self) -> frozenset[str]:
+        return frozenset(
+            each.bound_robot
+            for driver in self._drivers.values()
+            for each in machine.active(driver.record)
+            if each.bound_robot
+        )
+
+    def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
+        """Order the gateways for a subtask by the coarse score."""
+        registry = self.plane.registry
+        return place(
+            need_of(self.manifest(target.subtask.skill)),
+            here=self.plane.gateway,
+            gateways={
+                name: status for name, status in registry.gateways.items() if name in self.plane.members()
+            },
+            containers=registry.containers,
+            holds=_holds(record, target),
+            robot=registry.robots.get(robot) if robot else None,
+            avoid=frozenset(each.gateway for each in target.attempts if each.failure),
+            config=self.config,
+        )
+
+    async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
+        """Send a run order; to this gateway it is a call."""
+        if gateway == self.plane.gateway:
+            return await self._executor.run(request)
+        return await self.plane.rpc.call(
+            gateway, "run", request, RunAccepted, timeout_s=self.config.run_timeout_s
+        )
+
+    # --- questions --------------------------------------------------------------------------------------------
+
+    async def task(self, ask: TaskAsk) -> TaskRecord:
+        """Return a task's record; NotFoundError when there is none."""
+        if driver := self._drivers.get(ask.id):
+            return driver.record
+        stored = await self.plane.dht.read(task_key(check_name(ask.id, "task")))
+        if stored is None or stored.deleted:
+            raise NotFoundError(f"there is no task {ask.id}", remedy="see `swiftbot task list`")
+        return msgspec.json.decode(stored.value, type=TaskRecord)
+
+    async def tasks(self, ask: TasksAsk) -> TaskList:
+        """Return the newest tasks, of the whole fleet or of this gateway's shard."""
+        found: dict[str, TaskRecord] = {}
+        for stored in await self.plane.dht.local("task/"):
+            if not stored.deleted:
+                with contextlib.suppress(msgspec.DecodeError):
+                    record = msgspec.json.decode(stored.value, type=TaskRecord)
+                    found[record.id] = record
+        for driver in self._drivers.values():
+            found[driver.record.id] = driver.record
+        unreachable: list[str] = []
+        if not ask.local:
+            others = sorted(self.plane.members() - {self.plane.gateway})
+            answers = await asyncio.gather(
+                *(
+                    self.plane.rpc.call(other, "tasks", replace(ask, local=True), TaskList, timeout_s=2.0)
+                    for other in others
+                ),
+                return_exceptions=True,
+            )
+            for other, answer in zip(others, answers, strict=True):
+                if isinstance(answer, TaskList):
+                    for record in answer.tasks:
+                        if record.id not in found or found[record.id].sequence < record.sequence:
+                            found[record.id] = record
+                elif isinstance(answer, SwiftbotError):
+                    unreachable.append(other)
+                else:
+                    raise answer
+        newest = sorted(found.values(), key=lambda record: (record.created_ns, record.id), reverse=True)
+        return TaskList(tasks=tuple(newest[: max(0, ask.limit)]), unreachable=tuple(unreachable))
+
+    async def cancel(self, ask: TaskAsk) -> TaskRecord:
+        """Stop a task wherever it is coordinated; returns its record at that moment."""
+        if ask.id in self._drivers:
+            return await self.cancel_here(ask)
+        record = await self.task(ask)
+        if record.state.final:
+            return record
+        owner = self.plane.ring.owner(task_key(ask.id))
+        if owner == self.plane.gateway:
+            self._sweep.set()
+            return await self.cancel_here(ask)
+        return await self.plane.rpc.call(owner, "cancel_here", ask, TaskRecord)
+
+    async def cancel_here(self, ask: TaskAsk) -> TaskRecord:
+        """Stop a task that is coordinated here; waits a moment for a driver that is being set up."""
+        for _ in range(20):
+            if driver := self._drivers.get(ask.id):
+                driver.tell(CancelAsked())
+                return driver.record
+            record = await self.task(ask)
+            if record.state.final:
+                return record
+            await asyncio.sleep(0.1)
+        raise UnreachableError(f"nobody coordinates task {ask.id} just now", remedy="try again in a second")
+
+
+def _holds(record: TaskRecord, target: SubtaskRecord) -> dict[str, float]:
+    """Share of the input files each gateway holds, over the results of the direct predecessors."""
+    held: dict[str, float] = {}
+    for before in target.subtask.after:
+        for gateway in _gateways_in(record.of(before).result):
+            held[gateway] = held.get(gateway, 0.0) + 1.0
+    total = sum(held.values())
+    return {gateway: count / total for gateway, count in held.items()}
+
+
+def _gateways_in(value: object) -> list[str]:
+    """Gateways named by artifact references anywhere in a result."""
+    if isinstance(value, dict):
+        if "artifact" in value and isinstance(value.get("gateway"), str):
+            return [str(value["gateway"])]
+        return [found for each in value.values() for found in _gateways_in(each)]
+    if isinstance(value, list | tuple):
+        return [found for each in value for found in _gateways_in(each)]
+    return []
