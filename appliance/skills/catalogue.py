@@ -1,0 +1,264 @@
+"""The skill catalogue: what a subtask may be, what it needs, and whether it can really be done here.
+
+Why it exists: the planner, the pool and the task manager must agree on one list of skills, and adding a skill
+must be adding a folder. So the list is the folders: `appliance/skills/<id>/skill.toml` is the manifest, and a
+`handler.py` beside it makes the skill one that can run. A skill without handler is known to the planner, which
+answers "skill not implemented" instead of guessing at another. Images are folders too
+(`images/<name>/image.toml`, with the Containerfile beside it).
+
+Loading is strict: an unknown key, a wrong type, a duplicated id or an image that is not there is a ConfigError
+with file and key, because a manifest that is half understood fails later, in a container, far from its cause.
+"""
+
+import hashlib
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct, field
+
+from appliance.errors import ConfigError
+
+SKILLS = Path(__file__).resolve().parent
+"""The built-in skills; bind-mounted read-only at `/skills` in every container."""
+
+DOMAINS = (
+    "navigation",
+    "manipulation",
+    "perception",
+    "coordination",
+    "inspection",
+    "interaction",
+    "media",
+    "learning",
+)
+"""What instructions are about; a plan names one of them."""
+
+NOT_SKILLS = frozenset({"_lib", "images", "sites", "__pycache__"})
+"""Folders beside the skills that hold something else: shared code of handlers, images, sites."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
+_REPOSITORY = "localhost/swiftbot"
+_Kind = TypeVar("_Kind")
+
+Word = Annotated[str, Meta(min_length=1, max_length=60)]
+
+
+class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One parameter of a skill; `description` helps people and the planner."""
+
+    type: Literal["string", "number", "integer", "array"]
+    required: bool
+    description: str = ""
+
+
+class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A skill as `skill.toml` describes it. The first half is what the planner sees, the second what a run needs."""
+
+    id: str
+    domain: str
+    summary: Annotated[str, Meta(min_length=1, max_length=200)]
+    params: dict[str, Param] = field(default_factory=dict[str, Param])
+    runs: Literal["robot", "compute"]
+    """On a robot, or anywhere."""
+    uses: tuple[Word, ...] = ()
+    """Actuators and sensors it occupies while it runs; two subtasks of a robot that share one are ordered."""
+    consumes: tuple[Word, ...] = ()
+    produces: tuple[Word, ...] = ()
+
+    image: str
+    """Image its handler runs in, a folder of `images/`."""
+    cpu: Annotated[float, Meta(gt=0, le=64)] = 0.5
+    """Cores a container must offer (algorithms: selection)."""
+    memory_mb: Annotated[int, Meta(ge=16, le=65536)] = 128
+    volumes: tuple[Word, ...] = ()
+    """Named volumes it wants mounted."""
+    preload: tuple[str, ...] = ()
+    """Modules the zygote imports beforehand, besides the handler itself and the image's own list."""
+    timeout_s: Annotated[float, Meta(gt=0, le=86400)] = 120.0
+    """Longest run, beyond a `duration_s` that was asked for."""
+    retries: Annotated[int, Meta(ge=0, le=10)] = 1
+    """Further attempts after a failure that another attempt may cure."""
+    verbs: tuple[Word, ...] = ()
+    """Robot commands its handler sends; a robot that lacks one cannot be given this skill."""
+
+    implemented: bool = False
+    """Whether `handler.py` is there. Set by the loader, never in the file."""
+    folder: Path = Path()
+    """Where it was read from. Set by the loader, never in the file."""
+
+
+class ImageSpec(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An image as `image.toml` describes it; `pool/images.py` builds it."""
+
+    name: str
+    packages: tuple[Word, ...]
+    """Debian packages it consists of."""
+    preload: tuple[str, ...] = ()
+    """Modules every zygote of this image imports beforehand."""
+    compatible: tuple[str, ...] = ()
+    """Images whose skills it can also run."""
+    folder: Path = Path()
+    """Where it was read from. Set by the loader, never in the file."""
+
+
+class Catalogue(Struct, frozen=True):
+    """All skills and images, by name. Shared by everyone who loads it: read, never changed."""
+
+    domains: tuple[str, ...]
+    skills: dict[str, SkillManifest]
+    images: dict[str, ImageSpec]
+
+
+def load_catalogue(extra: Sequence[Path] = ()) -> Catalogue:
+    """Load the built-in skills and those of `extra`: folders laid out like `appliance/skills`.
+
+    The result is kept for the life of the process: skills added later are seen after a restart.
+
+    Raises:
+        ConfigError: naming the file and the key, when anything in it is not as it should be.
+    """
+    return _load(tuple(Path(folder).resolve() for folder in extra))
+
+
+def image_reference(image: str, *, folder: Path | None = None) -> str:
+    """Return `localhost/swiftbot/<image>:<hash>`; the hash is of the image's folder, so a change is a new image.
+
+    Args:
+        image: name of a folder of `images/`.
+        folder: that folder itself, for an image that is not built in (`ImageSpec.folder`).
+
+    Raises:
+        ConfigError: when there is no such image.
+    """
+    where = folder or SKILLS / "images" / image
+    if not (where / "image.toml").is_file():
+        raise ConfigError(f"no image {image!r}: {where}/image.toml is missing", remedy="see docs/skills.md, Images")
+    digest = hashlib.sha256()
+    for file in sorted(where.rglob("*")):
+        if file.is_file() and "__pycache__" not in file.parts and not file.name.startswith("."):
+            data = file.read_bytes()
+            digest.update(f"{file.relative_to(where).as_posix()}\0{len(data)}\0".encode())
+            digest.update(data)
+    return f"{_REPOSITORY}/{image}:{digest.hexdigest()[:12]}"
+
+
+@lru_cache(maxsize=16)
+def _load(extra: tuple[Path, ...]) -> Catalogue:
+    roots = (SKILLS, *extra)
+    for root in roots:
+        if not root.is_dir():
+            raise ConfigError(f"{root}: no such folder of skills", remedy="create it, or take it out of the list")
+    images: dict[str, ImageSpec] = {}
+    skills: dict[str, SkillManifest] = {}
+    for root in roots:
+        for spec in _images(root):
+            if spec.name in images:
+                raise _wrong(
+                    spec.folder / "image.toml", "name", f"image {spec.name!r} is in {images[spec.name].folder} too"
+                )
+            images[spec.name] = spec
+    for spec in images.values():
+        for other in spec.compatible:
+            if other not in images:
+                raise _wrong(spec.folder / "image.toml", "compatible", f"there is no image {other!r}")
+    for root in roots:
+        for manifest in _manifests(root):
+            file = manifest.folder / "skill.toml"
+            if manifest.id in skills:
+                raise _wrong(file, "id", f"skill {manifest.id!r} is in {skills[manifest.id].folder} too")
+            if manifest.image not in images:
+                raise _wrong(
+                    file, "image", f"there is no image {manifest.image!r} (known: {', '.join(sorted(images))})"
+                )
+            skills[manifest.id] = manifest
+    ordered = sorted(skills.values(), key=lambda each: (DOMAINS.index(each.domain), each.id))
+    return Catalogue(DOMAINS, {each.id: each for each in ordered}, images)
+
+
+def _manifests(root: Path) -> Iterator[SkillManifest]:
+    for folder in _folders(root):
+        file = folder / "skill.toml"
+        if folder.name in NOT_SKILLS:
+            continue
+        if not file.is_file():
+            raise ConfigError(
+                f"{folder}: skill.toml is missing", remedy="write it as docs/skills.md shows, or remove the folder"
+            )
+        table = _read(file, {"implemented", "folder"})
+        manifest = _convert(file, table, SkillManifest)
+        _check_name(file, "id", manifest.id, folder)
+        if manifest.domain not in DOMAINS:
+            raise _wrong(file, "domain", f"{manifest.domain!r} is none of {', '.join(DOMAINS)}")
+        for param in manifest.params:
+            if not _NAME.fullmatch(param):
+                raise _wrong(file, f"params.{param}", "a parameter's name is of a-z, 0-9 and '_'")
+        if manifest.runs == "compute" and manifest.verbs:
+            raise _wrong(file, "verbs", "a skill that runs on no robot sends no robot commands")
+        yield msgspec.structs.replace(manifest, implemented=(folder / "handler.py").is_file(), folder=folder)
+
+
+def _images(root: Path) -> Iterator[ImageSpec]:
+    where = root / "images"
+    for folder in _folders(where) if where.is_dir() else ():
+        file = folder / "image.toml"
+        if not file.is_file():
+            raise ConfigError(f"{folder}: image.toml is missing", remedy="write it as docs/skills.md shows")
+        spec = _convert(file, _read(file, {"folder"}), ImageSpec)
+        _check_name(file, "name", spec.name, folder)
+        if not spec.packages:
+            raise _wrong(file, "packages", "an image needs at least python3")
+        yield msgspec.structs.replace(spec, folder=folder)
+
+
+def _folders(root: Path) -> Iterable[Path]:
+    return sorted(
+        each
+        for each in root.iterdir()
+        if each.is_dir() and each.name != "__pycache__" and not each.name.startswith(".")
+    )
+
+
+def _read(file: Path, reserved: set[str]) -> dict[str, Any]:
+    """Read a TOML file; keys the loader sets itself are unknown to people."""
+    try:
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{file}: cannot be read: {error}", remedy="mend the TOML there") from error
+    for key in sorted(reserved & table.keys()):
+        raise _wrong(file, key, "unknown key")
+    return table
+
+
+def _convert(file: Path, table: dict[str, Any], kind: type[_Kind]) -> _Kind:
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        raise validation_error(file, error) from error
+
+
+def validation_error(file: Path, error: msgspec.ValidationError) -> ConfigError:
+    """Turn msgspec's complaint (``… - at `$.params.x` ``) into one that names the file and the key."""
+    text = str(error)
+    what, _, at = text.partition(" - at ")
+    key = at.strip("`").removeprefix("$").lstrip(".")
+    named = re.search(r"(?:unknown|required) field `([^`]+)`", what)
+    if named:
+        key = f"{key}.{named.group(1)}" if key else named.group(1)
+        what = "unknown key" if "unknown" in what else "missing"
+    return _wrong(file, key or "(whole file)", what)
+
+
+def _check_name(file: Path, key: str, name: str, folder: Path) -> None:
+    if not _NAME.fullmatch(name):
+        raise _wrong(file, key, f"{name!r} is not a name of a-z, 0-9 and '_' that starts with a letter")
+    if name != folder.name:
+        raise _wrong(file, key, f"{name!r} is not the folder's name {folder.name!r}")
+
+
+def _wrong(file: Path, key: str, what: str) -> ConfigError:
+    return ConfigError(f"{file}: {key}: {what}", remedy="docs/skills.md lists the keys and what they hold")

@@ -1,0 +1,117 @@
+"""Sites: the maps that give names in instructions a meaning, read strictly from TOML.
+
+Why it exists: a place that is mistyped in a site file would otherwise show up as a robot that drives to the
+wrong spot. So names, aliases and coordinates are checked before anything moves.
+"""
+
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+
+from appliance.errors import ConfigError
+from appliance.model import Box, Place, Site, SiteObject
+from appliance.skills.catalogue import SKILLS, validation_error
+
+SITES = SKILLS / "sites"
+"""The sites that come with the product."""
+
+_REMEDY = "see docs/skills.md, Sites"
+_BUILT_IN = re.compile(r"[a-z][a-z0-9_-]*")
+
+
+def load_site(where: str | Path) -> Site:
+    """Load a site: the name of one that comes with the product, or the path of a TOML file.
+
+    Raises:
+        ConfigError: naming the file and the key; unknown keys, wrong types, names that two places share,
+            boxes without extent and objects at places that are not there are all refused.
+    """
+    built_in = isinstance(where, str) and _BUILT_IN.fullmatch(where) is not None
+    file = SITES / f"{where}.toml" if built_in else Path(where)
+    if not file.is_file():
+        known = ", ".join(sorted(each.stem for each in SITES.glob("*.toml")))
+        raise ConfigError(f"there is no site {str(where)!r}", remedy=f"give a TOML file, or one of: {known}")
+    try:
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{file}: cannot be read: {error}", remedy="mend the TOML there") from error
+    _check_keys(file, table)
+    try:
+        site = msgspec.convert(table, Site)
+    except msgspec.ValidationError as error:
+        raise validation_error(file, error) from error
+    _check_places(file, site)
+    _check_things(file, site)
+    return site
+
+
+def plain_name(name: str) -> str:
+    """Return a name as instructions and sites compare it: lower case, single spaces, no articles."""
+    return " ".join(word for word in name.lower().replace("_", " ").split() if word not in ("the", "a", "an"))
+
+
+def _check_keys(file: Path, table: dict[str, Any]) -> None:
+    """Refuse keys that no struct has; the structs themselves are lenient, for the wire's sake."""
+    rows: list[tuple[str, Any, type[msgspec.Struct]]] = [("", table, Site)]
+    places = table.get("places")
+    if isinstance(places, dict):
+        rows += [(f"places.{name}.", row, Place) for name, row in cast("dict[str, Any]", places).items()]
+    for key, kind in (("obstacles", Box), ("forbidden", Box), ("objects", SiteObject)):
+        many = table.get(key)
+        if isinstance(many, list):
+            rows += [(f"{key}[{index}].", row, kind) for index, row in enumerate(cast("list[Any]", many))]
+    for at, row, kind in rows:
+        if isinstance(row, dict):
+            for key in cast("dict[str, Any]", row):
+                if key not in kind.__struct_fields__:
+                    raise _wrong(file, f"{at}{key}", "unknown key")
+
+
+def _check_places(file: Path, site: Site) -> None:
+    if not site.places:
+        raise _wrong(file, "places", "a site needs at least one place")
+    owner: dict[str, str] = {}
+    for name, place in site.places.items():
+        for key, each in ((f"places.{name}", name), *((f"places.{name}.aliases", alias) for alias in place.aliases)):
+            if not each or each != plain_name(each):
+                raise _wrong(file, key, f"{each!r} is not plain: lower case, single spaces, no article")
+            if owner.setdefault(each, name) != name:
+                raise _wrong(file, key, f"{each!r} means {owner[each]!r} too")
+        for axis, value in (("x", place.x), ("y", place.y), ("z", place.z)):
+            if not math.isfinite(value):
+                raise _wrong(file, f"places.{name}.{axis}", f"{value} is no coordinate")
+        if not 0 <= place.z <= site.altitude_limit_m:
+            raise _wrong(file, f"places.{name}.z", f"{place.z} m is not between 0 and altitude_limit_m")
+        for box in (*site.obstacles, *site.forbidden):
+            if box.x[0] < place.x < box.x[1] and box.y[0] < place.y < box.y[1]:
+                raise _wrong(file, f"places.{name}", f"lies inside {box.name!r}, where no robot may go")
+
+
+def _check_things(file: Path, site: Site) -> None:
+    for key, value in (("altitude_limit_m", site.altitude_limit_m), ("speed_limit_mps", site.speed_limit_mps)):
+        if not (math.isfinite(value) and value > 0):
+            raise _wrong(file, key, f"{value} is not more than 0")
+    if not (-90 <= site.latitude_deg <= 90 and -180 <= site.longitude_deg <= 180):
+        raise _wrong(file, "latitude_deg", f"{site.latitude_deg}, {site.longitude_deg} is nowhere on Earth")
+    for key, boxes in (("obstacles", site.obstacles), ("forbidden", site.forbidden)):
+        for index, box in enumerate(boxes):
+            for axis, (low, high) in (("x", box.x), ("y", box.y)):
+                if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                    raise _wrong(file, f"{key}[{index}].{axis}", f"{box.name!r}: [{low}, {high}] is no extent")
+    names: set[str] = set()
+    for index, thing in enumerate(site.objects):
+        if thing.name in names:
+            raise _wrong(file, f"objects[{index}].name", f"there are two of {thing.name!r}")
+        names.add(thing.name)
+        if site.find(thing.at) is None:
+            raise _wrong(file, f"objects[{index}].at", f"there is no place {thing.at!r}")
+        if not 0 < thing.size <= 10:
+            raise _wrong(file, f"objects[{index}].size", f"{thing.size} m is not a size of 0 to 10 m")
+
+
+def _wrong(file: Path, key: str, what: str) -> ConfigError:
+    return ConfigError(f"{file}: {key}: {what}", remedy=_REMEDY)
