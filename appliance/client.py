@@ -1,0 +1,141 @@
+"""What a person's command does over Zenoh: one small client for the command line, the demo and the benchmarks.
+
+It sits anywhere on the Zenoh network, asks any gateway, and knows nothing of a gateway's inside.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from types import TracebackType
+from typing import Self
+
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
+from appliance.model import Notice, RunEvent, TaskRecord, TaskRequest, TaskState
+from appliance.plane.node import PlaneClient
+from appliance.plane.settings import PlaneConfig
+from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+
+
+class Endpoint(Struct, frozen=True, kw_only=True):
+    """Where a fleet is: its name, and endpoints of gateways or routers (`tcp/host:port`)."""
+
+    fleet: str
+    connect: tuple[str, ...]
+
+
+class FleetClient:
+    """A connection to a fleet; use it as an async context manager."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self._plane: PlaneClient | None = None
+
+    async def __aenter__(self) -> Self:
+        self._plane = await PlaneClient.open(
+            PlaneConfig(mode="client", connect=self.endpoint.connect), fleet=self.endpoint.fleet
+        )
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._plane is not None:
+            await self._plane.close()
+            self._plane = None
+
+    @property
+    def plane(self) -> PlaneClient:
+        """The open connection."""
+        if self._plane is None:
+            raise UnreachableError("the connection to the fleet is not open")
+        return self._plane
+
+    async def gateway(self) -> str:
+        """Any gateway that is present; UnreachableError when there is none."""
+        return await self.plane.any_gateway()
+
+    async def plan(self, instruction: str) -> PlanAnswer:
+        """Decompose, run nothing."""
+        ask = PlanAsk(instruction=instruction)
+        return await self.plane.rpc.call(await self.gateway(), "plan", ask, PlanAnswer, timeout_s=60.0)
+
+    async def submit(self, request: TaskRequest) -> TaskRecord:
+        """Hand in a task; durable when this returns."""
+        return await self.plane.rpc.call(await self.gateway(), "submit", request, TaskRecord, timeout_s=10.0)
+
+    async def task(self, task: str) -> TaskRecord:
+        """One task's record."""
+        return await self.plane.rpc.call(await self.gateway(), "task", TaskAsk(id=task), TaskRecord)
+
+    async def tasks(self, limit: int) -> TaskList:
+        """The newest tasks of the fleet."""
+        return await self.plane.rpc.call(await self.gateway(), "tasks", TasksAsk(limit=limit), TaskList)
+
+    async def cancel(self, task: str) -> TaskRecord:
+        """Stop a task."""
+        return await self.plane.rpc.call(await self.gateway(), "cancel", TaskAsk(id=task), TaskRecord)
+
+    async def watch(self, task: str, *, poll_s: float = 1.0) -> AsyncIterator[TaskRecord]:
+        """Yield a task's record whenever it changes, until it has ended; survives the loss of gateways.
+
+        Changes are pushed; every `poll_s` the record is asked for as well, in case a push was missed.
+        """
+        queue: asyncio.Queue[TaskRecord] = asyncio.Queue()
+
+        def take(key: str, record: TaskRecord | None) -> None:  # noqa: ARG001 - the record names its task
+            if record is not None:
+                queue.put_nowait(record)
+
+        closer = self.plane.session.subscribe_typed(self.plane.keys.task(task), TaskRecord, take)
+        try:
+            last: TaskRecord | None = None
+            silent = 0
+            queue.put_nowait(await self.task(task))
+            while last is None or not last.state.final:
+                try:
+                    record = await asyncio.wait_for(queue.get(), timeout=poll_s)
+                except TimeoutError:
+                    try:
+                        record = await self.task(task)
+                        silent = 0
+                    except SwiftbotError:
+                        silent += 1
+                        if silent > 30:
+                            raise
+                        continue
+                if last is None or record.sequence > last.sequence or record.coordinator != last.coordinator:
+                    last = record
+                    yield record
+        finally:
+            closer.close()
+
+    async def planned(self, task: str, *, timeout_s: float = 60.0) -> TaskRecord:
+        """Wait until a task has a plan or has ended."""
+
+        async def wait() -> TaskRecord:
+            async with contextlib.aclosing(self.watch(task, poll_s=0.2)) as changes:
+                async for record in changes:
+                    if record.state is not TaskState.ACCEPTED:
+                        return record
+            raise DeadlineError(f"task {task} has no plan yet")
+
+        try:
+            return await asyncio.wait_for(wait(), timeout_s)
+        except TimeoutError:
+            raise DeadlineError(
+                f"task {task} has no plan after {timeout_s:.0f} s", remedy=f"see `swiftbot task show {task}`"
+            ) from None
+
+    def on_notice(self, take: "asyncio.Queue[Notice]") -> None:
+        """Have notices to people put into a queue."""
+        self.plane.session.subscribe_typed(
+            self.plane.keys.notice(), Notice, lambda _, notice: take.put_nowait(notice) if notice else None
+        )
+
+    def on_run(self, task: str, take: "asyncio.Queue[RunEvent]") -> None:
+        """Have the events of a task's runs put into a queue."""
+        self.plane.session.subscribe_typed(
+            self.plane.keys.run(task), RunEvent, lambda _, event: take.put_nowait(event) if event else None
+        )

@@ -1,0 +1,117 @@
+"""One TOML file a gateway: read strictly, so that a typing error is an error and not a silent default.
+
+Each room defines its own section; this module only composes them. `docs/configuration.md` lists every key with
+its default and the reason for it, made from these structs.
+"""
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct, field
+
+from appliance.errors import ConfigError, PayloadError
+from appliance.llm.settings import LlmConfig
+from appliance.plane.keys import check_name
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.settings import PoolConfig
+from appliance.record.settings import RecordConfig
+from appliance.robots.settings import RobotsConfig
+from appliance.tasks.settings import TasksConfig
+
+
+class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything that can be set of a gateway; sections are the rooms."""
+
+    id: str
+    """Name of this gateway, unique in the fleet and kept for good: its place on the ring follows from it."""
+    fleet: str = "default"
+    """Gateways, robots and clients of one fleet see each other; others on the same network do not."""
+    data_dir: str = "/var/lib/swiftbot/data"
+    """SQLite file and artifacts."""
+    run_dir: str = ""
+    """Sockets into containers; empty: under XDG_RUNTIME_DIR. Short, since socket paths end at 108 bytes."""
+    site: str = "warehouse"
+    """Name of a built-in site, or path of a site file: what place names mean, and where robots must not go."""
+    skills: tuple[str, ...] = ()
+    """Folders with further skills, beside the built-in ones."""
+    log_level: str = "info"
+    log_format: str = "json"
+    """`json` for journald and machines, `text` for a terminal."""
+    drain_s: float = 20.0
+    """On SIGTERM: how long runs in progress may take to end before they are cancelled."""
+    keep_containers: bool = True
+    """On SIGTERM: leave warm containers running for the next start to adopt."""
+    status_s: float = 2.0
+    """How often the gateway's status is put when nothing changes."""
+    plane: PlaneConfig = field(default_factory=PlaneConfig)
+    pool: PoolConfig = field(default_factory=PoolConfig)
+    llm: LlmConfig = field(default_factory=LlmConfig)
+    robots: RobotsConfig = field(default_factory=RobotsConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
+    tasks: TasksConfig = field(default_factory=TasksConfig)
+
+
+def load(path: Path) -> GatewayConfig:
+    """Read a configuration file.
+
+    Raises:
+        ConfigError: it is absent, not TOML, or a key is unknown, of the wrong type or not allowed; the message
+            names file and key.
+    """
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise ConfigError(
+            f"configuration {path} cannot be read: {error.strerror}", remedy="give a file with --config"
+        ) from error
+    try:
+        config = msgspec.convert(tomllib.loads(text), GatewayConfig)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not TOML: {error}", remedy="see docs/configuration.md") from error
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {error}", remedy="see docs/configuration.md for the keys") from error
+    check(config, str(path))
+    return config
+
+
+def check(config: GatewayConfig, source: str) -> None:
+    """Check what types cannot tell; ConfigError names the key."""
+    try:
+        check_name(config.id, "id")
+        check_name(config.fleet, "fleet")
+        config.robots.check()
+        config.record.check()
+    except (PayloadError, ConfigError) as error:
+        raise ConfigError(f"{source}: {error.message}", remedy=error.remedy) from error
+    if config.log_level not in ("debug", "info", "warning", "error"):
+        raise ConfigError(f"{source}: log_level {config.log_level!r}", remedy="use debug, info, warning or error")
+    if config.log_format not in ("json", "text"):
+        raise ConfigError(f"{source}: log_format {config.log_format!r}", remedy="use json or text")
+
+
+def dump(config: GatewayConfig) -> str:
+    """Write a configuration as TOML with all that differs from the defaults."""
+    lines: list[str] = []
+    tables: list[str] = []
+    defaults = msgspec.to_builtins(GatewayConfig(id=config.id))
+    for key, value in msgspec.to_builtins(config).items():
+        if isinstance(value, dict):
+            changed = {k: v for k, v in value.items() if v != defaults[key].get(k)}
+            if changed:
+                tables += ["", f"[{key}]", *(f"{k} = {_toml(v)}" for k, v in changed.items())]
+        elif key == "id" or value != defaults[key]:
+            lines.append(f"{key} = {_toml(value)}")
+    return "\n".join([*lines, *tables, ""])
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{msgspec.json.encode(str(k)).decode()} = {_toml(v)}" for k, v in value.items()) + "}"  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(each) for each in value) + "]"  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, str):
+        return msgspec.json.encode(value).decode()
+    return repr(value)
