@@ -1,0 +1,255 @@
+"""Composition root of the daemon: builds the parts, starts them in order, watches them, stops them in reverse.
+
+Order: plane (others can find us) → language model → robots → pool → tasks; the gateway takes part in the ring
+from the first step but accepts runs only when its pool is there. On SIGTERM: say that we drain, let runs end,
+hand over coordination (the next owner of each key goes on), leave the warm containers for the next start.
+"""
+
+import asyncio
+import contextlib
+import os
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import msgspec
+import psutil
+import sdnotify
+import structlog
+
+from appliance import logs
+from appliance.config import GatewayConfig
+from appliance.errors import ConfigError, SwiftbotError
+from appliance.llm.cascade import Decomposer
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, LogLine, Need, RunRequest, Site, TaskRequest
+from appliance.plane.node import Plane
+from appliance.pool.pool import Call, Pool
+from appliance.robots.hub import RobotHub
+from appliance.skills.catalogue import Catalogue, load_catalogue
+from appliance.skills.sites import load_site
+from appliance.tasks.api import ArtifactAsk, RunAsk
+from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.calls import Calls
+from appliance.tasks.executor import Executor
+from appliance.tasks.manager import TaskManager
+from appliance.tasks.remote import RemoteContainers
+
+log = structlog.get_logger(__name__)
+
+VERSION = "0.1.0"
+
+
+class Gateway:
+    """One gateway. `start` and `stop` do all; `run` is the daemon around them."""
+
+    def __init__(self, config: GatewayConfig) -> None:
+        self.config = config
+        self._data = Path(config.data_dir).expanduser()
+        self._started_ns = time.time_ns()
+        self._stack = contextlib.AsyncExitStack()
+        self._process = psutil.Process()
+        self._changed = asyncio.Event()
+        self._draining = False
+        self._ready = False
+
+    async def start(self) -> None:
+        """Build and start every part; on failure, what was started is stopped again and the error raised."""
+        try:
+            await self._start()
+        except BaseException:
+            await self._stack.aclose()
+            raise
+
+    async def _start(self) -> None:
+        config = self.config
+        catalogue, site = self._load()
+        self._make_directories()
+        self.plane = await Plane.open(
+            config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data
+        )
+        self._stack.push_async_callback(self.plane.close)
+        logs.publish_to(self._put_log)
+        self._stack.callback(logs.publish_to, None)
+
+        self.decomposer = Decomposer(config.llm, catalogue)
+        await self.decomposer.start()
+        self._stack.push_async_callback(self.decomposer.close)
+
+        self.hub = RobotHub(
+            config.robots, session=self.plane.session, store=self.plane.store, gateway=config.id, site=site,
+            on_task=self._on_robot_task,
+        )
+        await self.hub.start()
+        self._stack.push_async_callback(self.hub.stop)
+
+        artifacts = Artifacts(
+            self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
+        )
+        calls = Calls(self.plane, artifacts, on_wait=lambda call, note: self.executor.waits(call, note))
+        remote = RemoteContainers(self.plane, successors=config.plane.find_successors)
+
+        async def on_call(call: Call) -> dict[str, object]:
+            return await calls(call)
+
+        self.pool = Pool(
+            config.pool,
+            gateway=config.id,
+            fleet=config.fleet,
+            run_dir=self._run_dir(),
+            catalogue=catalogue,
+            site=site,
+            find_remote=remote.find,
+            on_call=on_call,
+            on_change=self._on_containers,
+        )
+        self.executor = Executor(self.plane, self.pool)
+        self.executor.on_change = self._changed.set
+        await self.executor.start()
+        await self.pool.start()
+        self._stack.push_async_callback(self._stop_pool)
+
+        rpc = self.plane.rpc
+        rpc.register("run", RunRequest, self.executor.run)
+        rpc.register("run_status", RunAsk, self.executor.status)
+        rpc.register("run_cancel", RunAsk, self.executor.cancel)
+        rpc.register("artifact", ArtifactAsk, artifacts.piece)
+        rpc.register("find_containers", Need, remote.answer)
+
+        self.manager = TaskManager(
+            config.tasks,
+            plane=self.plane,
+            catalogue=catalogue,
+            decomposer=self.decomposer,
+            executor=self.executor,
+            site=site,
+        )
+        self.manager.on_change = self._changed.set
+        await self.manager.start()
+        self._stack.push_async_callback(self.manager.stop)
+        self._publish_status()
+        status = asyncio.create_task(self._keep_publishing(), name="status")
+        self._stack.callback(status.cancel)
+        log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
+
+    def _load(self) -> tuple[Catalogue, Site]:
+        catalogue = load_catalogue(tuple(Path(each).expanduser() for each in self.config.skills))
+        return catalogue, load_site(self.config.site)
+
+    def _make_directories(self) -> None:
+        for directory in (self._data, self._run_dir()):
+            try:
+                directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            except OSError as error:
+                raise ConfigError(
+                    f"{directory} cannot be made: {error.strerror}", remedy="set data_dir and run_dir to writable places"
+                ) from error
+
+    def _run_dir(self) -> Path:
+        if self.config.run_dir:
+            return Path(self.config.run_dir)
+        base = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+        return Path(base) / "swiftbot" / self.config.fleet / self.config.id
+
+    async def _stop_pool(self) -> None:
+        await self.pool.stop(keep_containers=self.config.keep_containers)
+
+    async def stop(self) -> None:
+        """Drain, then stop every part in reverse order."""
+        self._draining = True
+        self.executor.draining = True
+        self._publish_status()
+        log.info("gateway drains", runs=self.executor.running, deadline_s=self.config.drain_s)
+        await self.executor.drain(self.config.drain_s)
+        await self._stack.aclose()
+
+    # --- facts about this gateway ---------------------------------------------------------------------------
+
+    def _on_containers(self, containers: tuple[ContainerInfo, ...]) -> None:
+        self.plane.registry.publish_containers(containers)
+        self._changed.set()
+
+    def _put_log(self, line: LogLine) -> None:
+        self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
+
+    def _on_robot_task(self, robot: str, request: TaskRequest) -> None:
+        """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""
+        if self.plane.ring.owner(f"robot/{robot}") != self.config.id:
+            return
+        handing_in = asyncio.ensure_future(self._hand_in(robot, request))
+        handing_in.add_done_callback(lambda done: done.exception())
+
+    async def _hand_in(self, robot: str, request: TaskRequest) -> None:
+        try:
+            await self.manager.submit(msgspec.structs.replace(request, submitter=request.submitter or robot))
+        except SwiftbotError as error:
+            self.plane.session.refused["robot task"] = self.plane.session.refused.get("robot task", 0) + 1
+            log.warning("a robot's task is refused", robot=robot, reason=str(error))
+
+    def status(self) -> GatewayStatus:
+        """This gateway's account of itself."""
+        containers = self.pool.containers()
+        capacity = self.config.pool.capacity
+        cpu = psutil.cpu_percent(interval=None)
+        counters = Counter(self.plane.session.refused) + Counter(self.hub.refused) + Counter(self.pool.refused)
+        return GatewayStatus(
+            id=self.config.id,
+            fleet=self.config.fleet,
+            version=VERSION,
+            load=min(1.0, max(cpu / 100, self.executor.running / max(1, capacity))),
+            cpu_percent=cpu,
+            memory_mb=round(self._process.memory_info().rss / 2**20, 1),
+            capacity=capacity,
+            containers=len(containers),
+            ready=sum(each.state is ContainerState.READY for each in containers),
+            running=self.executor.running,
+            tasks=self.manager.unfinished,
+            draining=self._draining,
+            limits_enforced=self.pool.limits_enforced,
+            pool_problem=self.pool.problem,
+            robots=self.hub.attached,
+            endpoints=self.config.plane.listen,
+            refused=dict(counters),
+            started_ns=self._started_ns,
+            pid=os.getpid(),
+        )
+
+    def _publish_status(self) -> None:
+        self.plane.registry.publish_status(self.status())
+
+    async def _keep_publishing(self) -> None:
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), timeout=self.config.status_s)
+            self._changed.clear()
+            self._publish_status()
+            await asyncio.sleep(0.05)
+
+
+async def run(config: GatewayConfig) -> None:
+    """Run the daemon until SIGTERM or SIGINT; a second signal stops it at once."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    notifier = sdnotify.SystemdNotifier()
+    gateway = Gateway(config)
+    await gateway.start()
+    notifier.notify("READY=1")
+    watchdog = asyncio.create_task(_watchdog(notifier), name="watchdog")
+    try:
+        await stop.wait()
+    finally:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.remove_signal_handler(number)
+        notifier.notify("STOPPING=1")
+        watchdog.cancel()
+        await gateway.stop()
+
+
+async def _watchdog(notifier: sdnotify.SystemdNotifier) -> None:
+    """Tell systemd that the event loop turns, at half the interval it asks for."""
+    interval_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
+    while interval_s:
+        notifier.notify("WATCHDOG=1")
+        await asyncio.sleep(interval_s)

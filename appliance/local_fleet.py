@@ -1,0 +1,342 @@
+"""A whole fleet on this machine: gateways, recorder and simulated robots, each a process of its own.
+
+What `swiftbot up` starts is what runs on separate machines: the same daemons with the same configuration
+files, only that they share a host. The state file in the fleet's directory names every process with its start
+time, so that `down` ends exactly those, and commands find the endpoints.
+"""
+
+import asyncio
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import psutil
+from msgspec import Struct
+
+from appliance import config as configuration
+from appliance.client import Endpoint, FleetClient
+from appliance.config import GatewayConfig
+from appliance.errors import ConfigError, DeadlineError, NotFoundError, PrerequisiteError, SwiftbotError
+from appliance.plane.keys import check_name
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.settings import PoolConfig
+from appliance.record.settings import RecordConfig
+from appliance.robots.settings import MavlinkLink, RobotsConfig
+
+Progress = Callable[[str], None]
+
+
+class Process(Struct, frozen=True, kw_only=True):
+    """A process of the fleet; `started` (Unix seconds) tells it from another with the same pid later."""
+
+    name: str
+    pid: int
+    started: float
+    log: str
+
+
+class FleetState(Struct, frozen=True, kw_only=True):
+    """The state file `fleet.json` of a local fleet."""
+
+    fleet: str
+    directory: str
+    endpoints: tuple[str, ...]
+    gateways: tuple[str, ...]
+    robots: tuple[str, ...]
+    record_dir: str
+    processes: tuple[Process, ...]
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """Where clients connect."""
+        return Endpoint(fleet=self.fleet, connect=self.endpoints)
+
+
+class Order(Struct, frozen=True, kw_only=True):
+    """What to start."""
+
+    fleet: str = "local"
+    directory: Path
+    gateways: int = 3
+    mavlink: int = 1
+    zenoh: int = 1
+    site: str = "warehouse"
+    sim_rate: float = 1.0
+    """How many times faster than real the simulated robots move."""
+    pool: PoolConfig = PoolConfig()
+    base: GatewayConfig | None = None
+    """Configuration that the gateways' own are made from."""
+
+
+def default_directory(fleet: str) -> Path:
+    """Where a local fleet keeps its files: under XDG_STATE_HOME."""
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(state) / "swiftbot" / fleet
+
+
+def read_state(directory: Path) -> FleetState:
+    """Read a fleet's state file; NotFoundError when no fleet was started there."""
+    path = directory / "fleet.json"
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=FleetState)
+    except FileNotFoundError:
+        raise NotFoundError(f"no fleet runs in {directory}", remedy="start one with `swiftbot up`") from None
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"{path} cannot be read: {error}", remedy="remove it and start the fleet anew") from error
+
+
+def alive(process: Process) -> bool:
+    """Whether that very process still runs."""
+    try:
+        found = psutil.Process(process.pid)
+        return abs(found.create_time() - process.started) < 1.0 and found.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A free loopback port; taken at once by the process it is for."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> FleetState:
+    """Start a fleet and wait until it can work.
+
+    Raises:
+        ConfigError: one of that name runs already, or a name or number is wrong.
+        PrerequisiteError: a process ended at once; the message has the end of its log.
+        DeadlineError: it was not ready in time; the message says what was missing.
+    """
+    check_name(order.fleet, "fleet")
+    if not 1 <= order.gateways <= 16:
+        raise ConfigError(f"{order.gateways} gateways", remedy="a local fleet has 1 to 16")
+    directory = order.directory
+    try:
+        running = [each for each in read_state(directory).processes if alive(each)]
+    except NotFoundError:
+        running = []
+    if running:
+        raise ConfigError(
+            f"a fleet runs in {directory} ({len(running)} processes)",
+            remedy="use it, or end it with `swiftbot down`, or give another --fleet or --dir",
+        )
+    starting = _Starting(order)
+    try:
+        state = starting.start_all(progress)
+        await _wait_ready(state, order, progress, timeout_s)
+    except BaseException:
+        await _end(starting.processes, grace_s=10.0)
+        raise
+    return state
+
+
+class _Starting:
+    """Writes the configuration files and starts the processes."""
+
+    def __init__(self, order: Order) -> None:
+        self._order = order
+        self.processes: list[Process] = []
+
+    def start_all(self, progress: Progress) -> FleetState:
+        order, directory = self._order, self._order.directory
+        (directory / "logs").mkdir(parents=True, exist_ok=True)
+        record_dir = directory / "record"
+        ports = [free_port() for _ in range(order.gateways)]
+        endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
+        names = tuple(f"gw-{number + 1}" for number in range(order.gateways))
+        udp_ports = [free_port(socket.SOCK_DGRAM) for _ in range(order.mavlink)]
+        drones = tuple(f"drone_{number + 1}" for number in range(order.mavlink))
+        rovers = tuple(f"rover_{number + 1}" for number in range(order.zenoh))
+        for index, name in enumerate(names):
+            links = tuple(
+                MavlinkLink(listen=f"udp://127.0.0.1:{udp_ports[drone]}", names={str(drone + 1): drones[drone]})
+                for drone in range(order.mavlink)
+                if drone % order.gateways == index
+            )
+            config = self._config(name, endpoints, index, links, record_dir)
+            path = directory / name / "gateway.toml"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(configuration.dump(config))
+            self._spawn(name, "gateway", "--config", str(path))
+        self._spawn("recorder", "record", "--config", str(directory / names[0] / "gateway.toml"))
+        for number, drone in enumerate(drones):
+            self._spawn(
+                drone, "sim", "mavlink", "--to", f"udp://127.0.0.1:{udp_ports[number]}",
+                "--system", str(number + 1), "--site", order.site, "--rate", str(order.sim_rate),
+            )
+        for rover in rovers:
+            self._spawn(
+                rover, "sim", "zenoh", "--name", rover, "--fleet", order.fleet,
+                *(each for endpoint in endpoints for each in ("--connect", endpoint)),
+                "--site", order.site, "--rate", str(order.sim_rate),
+            )
+        state = FleetState(
+            fleet=order.fleet,
+            directory=str(directory),
+            endpoints=endpoints,
+            gateways=names,
+            robots=(*drones, *rovers),
+            record_dir=str(record_dir),
+            processes=tuple(self.processes),
+        )
+        path = directory / "fleet.json"
+        temporary = path.with_suffix(".new")
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(state)))
+        temporary.replace(path)
+        progress(f"started {len(self.processes)} processes of fleet {order.fleet}")
+        return state
+
+    def _config(
+        self, name: str, endpoints: tuple[str, ...], index: int, links: tuple[MavlinkLink, ...], record_dir: Path
+    ) -> GatewayConfig:
+        base = self._order.base or GatewayConfig(id=name)
+        return msgspec.structs.replace(
+            base,
+            id=name,
+            fleet=self._order.fleet,
+            data_dir=str(self._order.directory / name / "data"),
+            site=self._order.site,
+            plane=PlaneConfig(
+                listen=(endpoints[index],),
+                connect=tuple(endpoint for at, endpoint in enumerate(endpoints) if at != index),
+            ),
+            pool=self._order.pool,
+            robots=RobotsConfig(mavlink=links),
+            record=RecordConfig(directory=str(record_dir)),
+        )
+
+    def _spawn(self, name: str, *arguments: str) -> None:
+        path = self._order.directory / "logs" / f"{name}.log"
+        with path.open("ab") as log:
+            pid = os.posix_spawn(
+                sys.executable,
+                [sys.executable, "-m", "appliance.cli", *arguments],
+                os.environ,
+                file_actions=[
+                    (os.POSIX_SPAWN_OPEN, 0, "/dev/null", os.O_RDONLY, 0),
+                    (os.POSIX_SPAWN_DUP2, log.fileno(), 1),
+                    (os.POSIX_SPAWN_DUP2, log.fileno(), 2),
+                ],
+                setsid=True,
+            )
+        self.processes.append(
+            Process(name=name, pid=pid, started=psutil.Process(pid).create_time(), log=str(path))
+        )
+
+
+async def _wait_ready(state: FleetState, order: Order, progress: Progress, timeout_s: float) -> None:
+    """Wait until every gateway has warm containers, every robot is online and the recorder writes."""
+    give_up = time.monotonic() + timeout_s
+    told = ""
+    async with FleetClient(state.endpoint) as client:
+        while True:
+            for process in state.processes:
+                if not alive(process):
+                    raise PrerequisiteError(
+                        f"{process.name} ended: {_tail(Path(process.log))}", remedy=f"see {process.log}"
+                    )
+            missing = _missing(client, state, order)
+            if not missing:
+                progress("the fleet is ready")
+                return
+            if time.monotonic() > give_up:
+                raise DeadlineError(
+                    f"the fleet was not ready within {timeout_s:.0f} s: {'; '.join(missing)}",
+                    remedy=f"see {state.directory}/logs and `swiftbot doctor`",
+                )
+            if missing[0] != told:
+                told = missing[0]
+                progress(told)
+            await asyncio.sleep(0.1)
+
+
+def _missing(client: FleetClient, state: FleetState, order: Order) -> list[str]:
+    registry = client.plane.registry
+    missing: list[str] = []
+    wanted = sum(order.pool.floor.values()) if order.pool.mode != "cold" else 0
+    for name in state.gateways:
+        status = registry.gateways.get(name)
+        if status is None:
+            missing.append(f"waiting for {name}")
+        elif status.pool_problem:
+            missing.append(f"{name}: {status.pool_problem}")
+        elif status.ready < min(wanted, order.pool.capacity):
+            missing.append(f"{name} warms containers: {status.ready} of {wanted}")
+    for robot in state.robots:
+        info = registry.robots.get(robot)
+        if info is None or not info.online:
+            missing.append(f"waiting for {robot}")
+    if not any(Path(state.record_dir).glob("*.mcap")):
+        missing.append("waiting for the recorder")
+    return missing
+
+
+def _tail(path: Path, lines: int = 5) -> str:
+    try:
+        return " | ".join(path.read_text(errors="replace").splitlines()[-lines:])[-1000:]
+    except OSError:
+        return "no log"
+
+
+async def down(directory: Path, *, progress: Progress, grace_s: float = 30.0) -> FleetState:
+    """End a fleet: its processes, gateways last, and its containers.
+
+    Raises:
+        NotFoundError: none was started there.
+    """
+    state = read_state(directory)
+    order = sorted(state.processes, key=lambda each: (each.name in state.gateways, each.name == "recorder"))
+    robots = [each for each in order if each.name in state.robots]
+    gateways = [each for each in order if each.name in state.gateways]
+    rest = [each for each in order if each not in robots and each not in gateways]
+    for group, what in ((robots, "robots"), (gateways, "gateways"), (rest, "recorder")):
+        if group:
+            progress(f"stopping {what}")
+            await _end(group, grace_s=grace_s)
+    await remove_containers(state.fleet, progress=progress)
+    (directory / "fleet.json").unlink(missing_ok=True)
+    return state
+
+
+async def remove_containers(fleet: str, *, progress: Progress) -> None:
+    """Remove the warm containers of a fleet; one that is not reachable is left and told."""
+    from appliance.pool.engine import remove_fleet  # noqa: PLC0415 - podman-py is slow to import
+
+    try:
+        removed = await remove_fleet(fleet)
+    except SwiftbotError as error:
+        progress(f"containers were left: {error}")
+        return
+    if removed:
+        progress(f"removed {removed} containers")
+
+
+async def _end(processes: list[Process], *, grace_s: float) -> None:
+    """SIGTERM, wait, SIGKILL; only the very processes that were started."""
+    for process in processes:
+        if alive(process):
+            os.kill(process.pid, signal.SIGTERM)
+    until = time.monotonic() + grace_s
+    while time.monotonic() < until and any(alive(each) for each in processes):
+        _reap(processes)
+        await asyncio.sleep(0.05)
+    for process in processes:
+        if alive(process):
+            os.kill(process.pid, signal.SIGKILL)
+    await asyncio.sleep(0.05)
+    _reap(processes)
+
+
+def _reap(processes: list[Process]) -> None:
+    for process in processes:
+        try:
+            os.waitpid(process.pid, os.WNOHANG)
+        except ChildProcessError:
+            continue
