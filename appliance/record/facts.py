@@ -1,0 +1,91 @@
+"""What a log tells: one message, a gap in it, a deletion, and the account of a file or a recorder.
+
+They exist apart from writer and reader because both sides, the CLI and the terminal UI speak in them.
+"""
+
+from msgspec import Struct, field
+
+
+class LoggedMessage(Struct, frozen=True):
+    """One put (or delete, when `deleted`) on a key. `at_ns` is Zenoh's timestamp, or the arrival's without one.
+
+    `encoding` is Zenoh's (`application/json`, ...).
+    """
+
+    key: str
+    at_ns: int
+    payload: bytes
+    encoding: str = ""
+    deleted: bool = False
+
+
+class Gap(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Messages that are not in the log, and why: what was dropped is itself written down."""
+
+    reason: str
+    """`queue full`, `disk full`, `too large` or `write error`."""
+    dropped: int
+    payload_bytes: int = 0
+    since_ns: int = 0
+    until_ns: int = 0
+    last_key: str = ""
+    """Key of the last message dropped, as a hint."""
+
+
+class Deletion(Struct, frozen=True, kw_only=True):
+    """A key that was deleted: a delete carries no payload, so it cannot stand on its key's own channel."""
+
+    key: str
+    at_ns: int
+
+
+class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A recorder's account of itself, put every second."""
+
+    id: str
+    fleet: str
+    state: str = "starting"
+    """`recording`, `paused` (see `problem`), `failed` or `stopped`."""
+    problem: str = ""
+    file: str = ""
+    """File name within the recorder's directory."""
+    files: int = 0
+    messages: int = 0
+    file_bytes: int = 0
+    queued: int = 0
+    dropped: dict[str, int] = field(default_factory=dict[str, int])
+    """Messages not recorded, by reason."""
+    started_ns: int = 0
+    at_ns: int = 0
+
+
+class ChannelInfo(Struct, frozen=True, kw_only=True):
+    """One channel of a log: `key` is the MCAP topic; `schema` is empty for a schemaless one."""
+
+    key: str
+    messages: int
+    schema: str = ""
+    encoding: str = ""
+
+
+class LogInfo(Struct, frozen=True, kw_only=True):
+    """What is in a log file."""
+
+    path: str
+    size_bytes: int
+    messages: int
+    channels: tuple[ChannelInfo, ...]
+    start_ns: int = 0
+    end_ns: int = 0
+    recovered: bool = False
+    """The file was not finished (recorder killed, power cut, disk full): all whole chunks of it were read."""
+    dropped: int = 0
+    """Messages that the recorder could not write, by its own account in the log's gaps."""
+    problems: tuple[str, ...] = ()
+    metadata: dict[str, str] = {}
+    """Fleet, version, recorder and start, as the recorder wrote them."""
+
+    @property
+    def duration_s(self) -> float:
+        """First to last message, seconds."""
+        return max(0, self.end_ns - self.start_ns) / 1e9

@@ -1,0 +1,244 @@
+"""Reading logs back: what is in one, its messages, and making a proper file of an unfinished one.
+
+A finished file is summed up from its index at once; any other is streamed (see `records`). Messages come in the
+order in which they were recorded, which is what a replay wants.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Message, Metadata, Schema
+from mcap.summary import Summary
+from mcap.writer import Writer
+
+from appliance.errors import RecordError
+from appliance.record.expressions import compile_expression
+from appliance.record.facts import ChannelInfo, Deletion, Gap, LoggedMessage, LogInfo
+from appliance.record.records import BROKEN, RecordStream, open_log
+from appliance.record.writer import METADATA, VERSION
+
+_GAPS = compile_expression("swiftbot/*/recorder/*/gap")
+_DELETIONS = compile_expression("swiftbot/*/recorder/*/deleted")
+
+
+def info(path: Path | str, *, verify: bool = False) -> LogInfo:
+    """Sum up a log.
+
+    Args:
+        path: The file.
+        verify: Read every message even of a finished file, so that damage in its middle is found.
+
+    Raises:
+        NotFoundError: no such file.
+        RecordError: not an MCAP file.
+    """
+    path = Path(path)
+    return (None if verify else _from_index(path)) or _by_streaming(path)
+
+
+def read(
+    path: Path | str, *, keys: Iterable[str] | str | None = None, problems: list[str] | None = None
+) -> Iterator[LoggedMessage]:
+    """Yield a log's messages in the order they were recorded; an unfinished file ends where it was cut off.
+
+    What the recorder added for Foxglove is left out; deletions come as messages with `deleted` set.
+
+    Args:
+        path: The file.
+        keys: Key expressions; only messages of keys that one of them includes. None: all.
+        problems: Takes the sentences about damage; without it damage raises after all that could be read.
+
+    Raises:
+        NotFoundError: no such file.
+        RecordError: not an MCAP file, or (at the end) parts of it are damaged.
+    """
+    path = Path(path)
+    wanted = None if keys is None else [compile_expression(key) for key in ((keys,) if isinstance(keys, str) else keys)]
+
+    def want(key: str) -> bool:
+        return wanted is None or any(pattern.fullmatch(key) for pattern in wanted)
+
+    stream = RecordStream(path)
+    taken: dict[int, bool] = {}
+    count = 0
+    for record in stream:
+        if isinstance(record, Channel):
+            taken[record.id] = record.metadata.get("derived") != "true" and (
+                want(record.topic) or _DELETIONS.fullmatch(record.topic) is not None
+            )
+        elif isinstance(record, Message) and taken[record.channel_id]:
+            channel = stream.channels[record.channel_id]
+            message = _logged(channel, record)
+            if message.key != channel.topic and not want(message.key):
+                continue
+            count += 1
+            yield message
+    if problems is not None:
+        problems.extend(stream.problems)
+    elif stream.problems:
+        raise RecordError(
+            f"{path} is damaged; {count} messages could be read: {'; '.join(stream.problems[:3])}",
+            remedy="the messages before this error are as they were written",
+        )
+
+
+def recover(path: Path | str, out: Path | str) -> LogInfo:
+    """Write all that can be read of `path` as a proper, finished file `out`; return what is in that.
+
+    Raises:
+        NotFoundError: no such file.
+        RecordError: not an MCAP file, or `out` exists or cannot be written.
+    """
+    path, out = Path(path), Path(out)
+    if out.exists():
+        raise RecordError(f"{out} exists already", remedy="name a file that does not")
+    part = out.with_name(out.name + ".part")
+    open_log(path).close()
+    try:
+        with part.open("wb") as file:
+            _copy(RecordStream(path), Writer(file, chunk_size=64 * 1024))
+            file.flush()
+            os.fsync(file.fileno())
+        part.rename(out)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RecordError(f"cannot write {out}: {error.strerror}", remedy="free space or name another file") from error
+    return info(out)
+
+
+def _copy(stream: RecordStream, writer: Writer) -> None:
+    """Copy records, giving schemas and channels new numbers (a file may announce them more than once)."""
+    writer.start(profile="", library=f"swiftbot {VERSION} recover")
+    schemas: dict[tuple[str, str, bytes], int] = {}
+    channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
+    numbers: dict[int, int] = {}
+    for record in stream:
+        if isinstance(record, Channel):
+            schema: Schema | None = stream.schemas.get(record.schema_id)
+            schema_number = 0
+            if schema is not None:
+                shape = (schema.name, schema.encoding, schema.data)
+                schema_number = schemas.get(shape) or writer.register_schema(*shape)
+                schemas[shape] = schema_number
+            like = (record.topic, record.message_encoding, schema_number, tuple(sorted(record.metadata.items())))
+            number = channels.get(like) or writer.register_channel(
+                record.topic, record.message_encoding, schema_number, record.metadata
+            )
+            channels[like] = numbers[record.id] = number
+        elif isinstance(record, Message):
+            writer.add_message(
+                numbers[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence
+            )
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
+    writer.finish()
+
+
+def _logged(channel: Channel, message: Message) -> LoggedMessage:
+    if _DELETIONS.fullmatch(channel.topic):
+        try:
+            deletion = msgspec.json.decode(message.data, type=Deletion)
+        except msgspec.MsgspecError:
+            pass  # a stranger's put on that key: give it as it is
+        else:
+            return LoggedMessage(deletion.key, message.log_time, b"", "", deleted=True)
+    encoding = channel.metadata.get("encoding", channel.message_encoding)
+    return LoggedMessage(channel.topic, message.log_time, message.data, encoding)
+
+
+def _gap_size(data: bytes) -> int:
+    try:
+        return msgspec.json.decode(data, type=Gap).dropped
+    except msgspec.MsgspecError:
+        return 0
+
+
+def _by_streaming(path: Path) -> LogInfo:
+    stream = RecordStream(path)
+    counts: dict[int, int] = {}
+    start = end = dropped = 0
+    metadata: dict[str, str] = {}
+    for record in stream:
+        if isinstance(record, Message):
+            number, at = record.channel_id, record.log_time
+            start = at if not counts else min(start, at)
+            end = max(end, at)
+            counts[number] = counts.get(number, 0) + 1
+            if _GAPS.fullmatch(stream.channels[number].topic):
+                dropped += _gap_size(record.data)
+        elif isinstance(record, Metadata) and record.name == METADATA:
+            metadata = record.metadata
+    problems = list(stream.problems)
+    if not stream.finished and not problems:
+        problems.append(
+            f"the file was not finished; all whole chunks were read, {stream.lost_bytes} bytes at its end were not"
+        )
+    return LogInfo(
+        path=str(path),
+        size_bytes=path.stat().st_size,
+        messages=sum(counts.values()),
+        channels=_channels(stream.channels, stream.schemas, counts),
+        start_ns=start,
+        end_ns=end,
+        recovered=not stream.finished,
+        dropped=dropped,
+        problems=tuple(problems),
+        metadata=metadata,
+    )
+
+
+def _from_index(path: Path) -> LogInfo | None:
+    """Sum up a finished file from its summary; None when it has none that will do (then it is streamed)."""
+    with open_log(path) as stream:
+        try:
+            reader = make_reader(stream)
+            summary = reader.get_summary()
+            if summary is None or not _complete(summary):
+                return None
+            assert summary.statistics is not None  # noqa: S101 - _complete has seen it
+            counts = summary.statistics.channel_message_counts
+            gaps = {channel.topic for channel in summary.channels.values() if _GAPS.fullmatch(channel.topic)}
+            dropped = sum(_gap_size(found[2].data) for found in reader.iter_messages(topics=gaps)) if gaps else 0
+            metadata = next((found.metadata for found in reader.iter_metadata() if found.name == METADATA), {})
+        except (*BROKEN, McapError, KeyError, OSError):
+            return None
+        return LogInfo(
+            path=str(path),
+            size_bytes=path.stat().st_size,
+            messages=summary.statistics.message_count,
+            channels=_channels(summary.channels, summary.schemas, counts),
+            start_ns=summary.statistics.message_start_time,
+            end_ns=summary.statistics.message_end_time,
+            dropped=dropped,
+            metadata=metadata,
+        )
+
+
+def _complete(summary: Summary) -> bool:
+    """Whether the summary repeats every channel and schema (it may legally not)."""
+    if summary.statistics is None:
+        return False
+    if any(number not in summary.channels for number in summary.statistics.channel_message_counts):
+        return False
+    return all(channel.schema_id == 0 or channel.schema_id in summary.schemas for channel in summary.channels.values())
+
+
+def _channels(
+    channels: dict[int, Channel], schemas: dict[int, Schema], counts: dict[int, int]
+) -> tuple[ChannelInfo, ...]:
+    found: list[ChannelInfo] = []
+    for channel in channels.values():
+        schema = schemas.get(channel.schema_id)
+        found.append(
+            ChannelInfo(
+                key=channel.topic,
+                messages=counts.get(channel.id, 0),
+                schema=schema.name if schema else "",
+                encoding=channel.message_encoding,
+            )
+        )
+    return tuple(sorted(found, key=lambda item: item.key))

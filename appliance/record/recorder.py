@@ -1,0 +1,224 @@
+"""The recorder: everything that is put under the fleet's keys goes into a file, and logging never slows the plane.
+
+Zenoh's callback only appends to a bounded intake; a thread of its own encodes, compresses and syncs. What does
+not fit is dropped, counted and written down in the log itself as a gap: a log that lacks something says so.
+"""
+
+import asyncio
+import contextlib
+import threading
+import time
+from typing import Protocol
+
+import structlog
+from msgspec import structs
+
+from appliance.errors import RecordError
+from appliance.model import encode
+from appliance.plane.session import Message, Session
+from appliance.plane.settings import PlaneConfig
+from appliance.record.facts import LoggedMessage, RecorderStatus
+from appliance.record.settings import RecordConfig
+from appliance.record.writer import LogWriter
+
+log = structlog.get_logger(__name__)
+
+_STOP_S = 30.0
+"""How long a stop waits for the thread: a slow disk may hold many queued pictures."""
+_TICK_S = 0.1
+
+
+class Closer(Protocol):
+    """What a subscription gives back."""
+
+    def close(self) -> None: ...  # noqa: D102
+
+
+class Intake:
+    """Messages between the event loop and the writer thread, bounded by number and by bytes.
+
+    `put` never waits; a message that does not fit is counted and handed over by the next `take`.
+    """
+
+    def __init__(self, *, messages: int, payload_bytes: int) -> None:
+        self._most, self._most_bytes = messages, payload_bytes
+        self._lock = threading.Lock()
+        self._some = threading.Event()
+        self._waiting: list[LoggedMessage] = []
+        self._bytes = 0
+        self._dropped = 0
+        self._dropped_bytes = 0
+        self._dropped_last = ("", 0)
+
+    def put(self, message: LoggedMessage) -> bool:
+        """Add a message; False when it was dropped."""
+        size = len(message.payload)
+        with self._lock:
+            full = len(self._waiting) >= self._most or self._bytes + size > self._most_bytes
+            if full:
+                self._dropped += 1
+                self._dropped_bytes += size
+                self._dropped_last = (message.key, message.at_ns)
+            else:
+                self._waiting.append(message)
+                self._bytes += size
+        self._some.set()
+        return not full
+
+    def take(self, wait_s: float) -> tuple[list[LoggedMessage], tuple[int, int, str, int]]:
+        """Return all that waits, and (number, bytes, last key, last time) dropped since the last take."""
+        self._some.wait(wait_s)
+        with self._lock:
+            self._some.clear()
+            out, self._waiting, self._bytes = self._waiting, [], 0
+            dropped = (self._dropped, self._dropped_bytes, *self._dropped_last)
+            self._dropped = self._dropped_bytes = 0
+        return out, dropped
+
+    def wake(self) -> None:
+        """End a waiting `take`."""
+        self._some.set()
+
+    def __len__(self) -> int:
+        """Messages waiting."""
+        return len(self._waiting)
+
+
+class Recorder:
+    """Records a fleet while it is started.
+
+    Args:
+        session: The plane's session; its fleet is what is recorded.
+        config: Where and how.
+        writer: Takes the place of the file writer in tests.
+    """
+
+    def __init__(self, session: Session, config: RecordConfig, *, writer: LogWriter | None = None) -> None:
+        self._session = session
+        self._config = config
+        self._writer = writer or LogWriter(config, fleet=session.keys.fleet)
+        self._intake = Intake(messages=config.queue_messages, payload_bytes=config.queue_bytes)
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._subscription: Closer | None = None
+        self._reporting: asyncio.Task[None] | None = None
+        self._status = RecorderStatus(id=config.name, fleet=session.keys.fleet, started_ns=time.time_ns())
+        self.failed = ""
+        """Why the writer thread ended by itself; empty while all is well."""
+
+    @property
+    def stats(self) -> RecorderStatus:
+        """The recorder's account of itself just now."""
+        return structs.replace(self._status, queued=len(self._intake), at_ns=time.time_ns())
+
+    async def start(self) -> None:
+        """Make the folder, start the thread, subscribe. RecordError when nothing can be written there."""
+        await asyncio.to_thread(self._writer.prepare)
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+        self._subscription = self._session.subscribe(self._session.keys.everything(), self._take)
+        self._reporting = asyncio.create_task(self._report(), name="recorder status")
+        log.info("recorder started", directory=str(self._config.folder), fleet=self._session.keys.fleet)
+
+    async def stop(self) -> None:
+        """Take no more, write what waits, finish the file."""
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None
+        if self._reporting is not None:
+            self._reporting.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._reporting
+            self._reporting = None
+        thread = self._thread
+        if thread is None:
+            return
+        self._stopping.set()
+        self._intake.wake()
+        await asyncio.to_thread(thread.join, _STOP_S)
+        if thread.is_alive():
+            raise RecordError(
+                f"the disk did not take the log within {_STOP_S:g} s",
+                remedy="what was flushed is readable: see `swiftbot log info`",
+            )
+        self._thread = None
+        self._publish()
+
+    def _take(self, message: Message) -> None:
+        self._intake.put(
+            LoggedMessage(
+                key=message.key,
+                at_ns=message.at_ns or time.time_ns(),
+                payload=message.payload,
+                encoding=message.encoding,
+                deleted=message.deleted,
+            )
+        )
+
+    def _run(self) -> None:
+        try:
+            while not (self._stopping.is_set() and not len(self._intake)):
+                self._write(*self._intake.take(_TICK_S))
+            self._write(*self._intake.take(0))  # drops counted since the last take
+            self._writer.close()
+            self._snapshot("stopped")
+        except Exception as error:  # the thread's one supervision boundary: the status tells, run_recorder ends
+            self.failed = f"the log writer failed: {error!r}"
+            log.exception("log writer failed")
+            self._snapshot("failed", self.failed)
+
+    def _write(self, batch: list[LoggedMessage], dropped: tuple[int, int, str, int]) -> None:
+        count, size, key, at_ns = dropped
+        for message in batch:
+            self._writer.write(message)
+        if count:
+            self._writer.drop("queue full", key, size, at_ns, count=count)
+        self._writer.tick()
+        self._snapshot("recording" if self._writer.recording or not self._writer.problem else "paused")
+
+    def _snapshot(self, state: str, problem: str = "") -> None:
+        writer = self._writer
+        self._status = structs.replace(
+            self._status,
+            state=state,
+            problem=problem or writer.problem,
+            file=writer.file,
+            files=len(writer.files),
+            messages=writer.messages,
+            file_bytes=writer.file_bytes,
+            dropped=dict(writer.dropped),
+        )
+
+    async def _report(self) -> None:
+        while True:
+            self._publish()
+            await asyncio.sleep(self._config.status_s)
+
+    def _publish(self) -> None:
+        self._session.put(self._session.keys.recorder_status(self._config.name), encode(self.stats))
+
+
+async def run_recorder(config: RecordConfig, plane_config: PlaneConfig, fleet: str, stop: asyncio.Event) -> None:
+    """Record a fleet until `stop` is set, in a process of its own (`swiftbot record`).
+
+    Raises:
+        ConfigError: a setting cannot work.
+        UnreachableError: the network could not be joined.
+        RecordError: the folder cannot be written, or the writer failed.
+    """
+    config.check()
+    session = await Session.open(plane_config, fleet)
+    try:
+        recorder = Recorder(session, config)
+        await recorder.start()
+        try:
+            while not stop.is_set() and not recorder.failed:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(config.status_s):
+                        await stop.wait()
+        finally:
+            await recorder.stop()
+        if recorder.failed:
+            raise RecordError(recorder.failed, remedy="what was flushed is readable; start the recorder again")
+    finally:
+        await session.close()
