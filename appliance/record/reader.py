@@ -202,8 +202,11 @@ def _from_index(path: Path) -> LogInfo | None:
             assert summary.statistics is not None  # noqa: S101 - _complete has seen it
             counts = summary.statistics.channel_message_counts
             gaps = {channel.topic for channel in summary.channels.values() if _GAPS.fullmatch(channel.topic)}
-            dropped = sum(_gap_size(found[2].data) for found in reader.iter_messages(topics=gaps)) if gaps else 0
-            metadata = next((found.metadata for found in reader.iter_metadata() if found.name == METADATA), {})
+            dropped = sum(_gap_size(message.data) for _, _, message in reader.iter_messages(topics=gaps)) if gaps else 0
+            metadata: dict[str, str] = {}
+            for found in reader.iter_metadata():
+                if found.name == METADATA:
+                    metadata = found.metadata
         except (*BROKEN, McapError, KeyError, OSError):
             return None
         return LogInfo(
