@@ -1,0 +1,299 @@
+"""How the command line shows things: plans as graphs, tasks, fleets. Prints only; decides nothing.
+
+Rich finds out whether it writes to a terminal: without one there are no colours and no live region.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from appliance.model import (
+    ContainerInfo,
+    GatewayStatus,
+    Plan,
+    RobotInfo,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+)
+from appliance.doctor import Check
+from appliance.pool.images import ImageState
+from appliance.record.facts import LogInfo
+from appliance.tasks.replay import ReplayReport
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+_STYLES = {
+    SubtaskState.WAITING: "dim",
+    SubtaskState.READY: "cyan",
+    SubtaskState.DISPATCHED: "cyan",
+    SubtaskState.RUNNING: "yellow",
+    SubtaskState.SUCCEEDED: "green",
+    SubtaskState.FAILED: "red",
+    SubtaskState.CANCELLED: "magenta",
+}
+_TASK_STYLES = {
+    TaskState.SUCCEEDED: "green",
+    TaskState.FAILED: "red",
+    TaskState.CANCELLED: "magenta",
+    TaskState.CANCELLING: "magenta",
+}
+
+
+def depths(plan: Plan) -> dict[str, int]:
+    """Length of the longest chain before each subtask: its column in the graph."""
+    after = {each.id: each.after for each in plan.subtasks}
+    found: dict[str, int] = {}
+
+    def depth(node: str) -> int:
+        if node not in found:
+            found[node] = 0
+            found[node] = max((depth(parent) + 1 for parent in after[node] if parent in after), default=0)
+        return found[node]
+
+    for node in after:
+        depth(node)
+    return found
+
+
+def params_text(params: dict[str, object]) -> str:
+    """Parameters as `name=value`."""
+    return " ".join(f"{key}={value}" for key, value in params.items())
+
+
+def plan_graph(plan: Plan) -> Group:
+    """A plan as a graph: one line a subtask, indented by depth, with what it comes after."""
+    depth = depths(plan)
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("subtask", "skill", "robot", "parameters", "after", "tier", "confidence"):
+        table.add_column(name, overflow="fold")
+    for each in plan.subtasks:
+        level = depth[each.id]
+        branch = "  " * max(0, level - 1) + ("└─▶ " if level else "")
+        table.add_row(
+            f"{branch}{each.id}",
+            each.skill,
+            each.robot or "–",
+            params_text(each.params),
+            ", ".join(each.after) or "–",
+            str(plan.tier),
+            f"{plan.confidence:.2f}",
+        )
+    ids = {each.id for each in plan.subtasks if depth[each.id] == 0}
+    head = Text(
+        f"plan: {plan.domain}, {len(plan.subtasks)} subtasks, {len(ids)} may start at once, "
+        f"planned in {plan.latency_ms:.0f} ms",
+        style="bold",
+    )
+    return Group(head, table)
+
+
+def milliseconds(value: float | None) -> str:
+    """A duration for people."""
+    if value is None:
+        return "–"
+    return f"{value:.1f} ms" if value < 1000 else f"{value / 1000:.1f} s"
+
+
+def brief(record: SubtaskRecord) -> str:
+    """A result or failure in a few words."""
+    if record.failure is not None and record.state is not SubtaskState.SUCCEEDED:
+        return record.failure.message
+    if record.note and not record.state.final:
+        return record.note
+    if not record.result:
+        return ""
+    shown: list[str] = []
+    for key, value in record.result.items():
+        if isinstance(value, dict):
+            if "artifact" in value:
+                shown.append(f"{key}={value.get('name')} ({value.get('bytes')} B)")  # pyright: ignore[reportUnknownMemberType]
+        elif isinstance(value, list):
+            shown.append(f"{key}: {len(value)}")  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            shown.append(f"{key}={str(value)[:60]}")
+    return " ".join(shown)[:160]
+
+
+def task_table(record: TaskRecord) -> Group:
+    """A task with its subtasks: where each ran, in which phase, how long, what came of it."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("subtask", "skill", "robot", "state", "gateway", "phase", "startup", "took", "tries", "result"):
+        table.add_column(name, overflow="fold", no_wrap=name in ("subtask", "skill", "state", "startup", "took"))
+    for each in record.subtasks:
+        table.add_row(
+            each.subtask.id,
+            each.subtask.skill,
+            each.bound_robot or each.subtask.robot or "–",
+            Text(str(each.state), style=_STYLES[each.state]),
+            each.gateway or "–",
+            str(each.phase or "–"),
+            milliseconds(each.startup_ms),
+            milliseconds(each.duration_ms),
+            str(each.attempt),
+            brief(each),
+        )
+    head = Text.assemble(
+        ("task ", "bold"),
+        record.id,
+        " ",
+        (str(record.state), _TASK_STYLES.get(record.state, "yellow")),
+        f"  coordinated by {record.coordinator}\n{record.instruction}",
+    )
+    parts: list[object] = [head, table]
+    if record.failure is not None:
+        remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""
+        parts.append(Text(f"{record.failure.message}{remedy}", style="red"))
+    return Group(*parts)  # pyright: ignore[reportArgumentType]
+
+
+def progress_line(record: SubtaskRecord) -> str:
+    """One line of live progress for logs and pipes."""
+    where = f" on {record.gateway}" if record.gateway else ""
+    share = f" {record.progress:.0%}" if record.state is SubtaskState.RUNNING and record.progress else ""
+    told = brief(record)
+    return f"  {record.subtask.id:>4} {record.subtask.skill:<14} {record.state}{where}{share}{'  ' + told if told else ''}"
+
+
+def task_list(records: Sequence[TaskRecord]) -> Table:
+    """Tasks, a line each."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("task", "state", "done", "coordinator", "instruction"):
+        table.add_column(name, overflow="fold")
+    for record in records:
+        done = sum(each.state is SubtaskState.SUCCEEDED for each in record.subtasks)
+        table.add_row(
+            record.id,
+            Text(str(record.state), style=_TASK_STYLES.get(record.state, "yellow")),
+            f"{done}/{len(record.subtasks)}",
+            record.coordinator,
+            record.instruction,
+        )
+    return table
+
+
+def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
+    """Gateways, a line each."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("gateway", "load", "memory", "containers", "runs", "tasks", "robots", "state"):
+        table.add_column(name, overflow="fold")
+    for each in gateways:
+        state = "draining" if each.draining else each.pool_problem or "up"
+        if not each.limits_enforced:
+            state += ", container limits not enforced"
+        table.add_row(
+            each.id,
+            f"{each.load:.0%}",
+            f"{each.memory_mb:.0f} MB",
+            f"{each.ready} ready of {each.containers} (at most {each.capacity})",
+            str(each.running),
+            str(each.tasks),
+            ", ".join(each.robots) or "–",
+            state,
+        )
+    return table
+
+
+def container_table(containers: Sequence[ContainerInfo]) -> Table:
+    """Pooled containers, a line each."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("gateway", "container", "image", "state", "runs", "cold start", "run"):
+        table.add_column(name, overflow="fold")
+    for each in containers:
+        table.add_row(
+            each.gateway, each.id[:12], each.image, str(each.state), str(each.runs), milliseconds(each.cold_ms), each.run
+        )
+    return table
+
+
+def robot_table(robots: Sequence[RobotInfo]) -> Table:
+    """Robots, a line each."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("robot", "kind", "by", "has", "pose", "battery", "mode", "state"):
+        table.add_column(name, overflow="fold")
+    for each in robots:
+        pose = f"{each.pose.x:.1f} {each.pose.y:.1f} {each.pose.z:.1f}" if each.pose else "–"
+        battery = f"{each.battery_percent:.0f} %" if each.battery_percent is not None else "–"
+        state = "online" if each.online else "offline"
+        if each.holding:
+            state += f", holds {each.holding}"
+        table.add_row(
+            each.id, each.kind, each.gateway or "itself", ", ".join(each.uses), pose, battery, each.mode, state
+        )
+    return table
+
+
+def replay_summary(report: ReplayReport) -> Group:
+    """Outcome of replaying a log."""
+    lines = [Text(f"replay of {report.path}: {report.messages:,} messages, {len(report.tasks)} tasks", style="bold")]
+    for task in report.tasks:
+        verdict = "same end state" if task.same else "DIFFERS"
+        lines.append(
+            Text(
+                f"  {task.task}  {verdict}: logged {task.logged}, replayed {task.replayed} "
+                f"({task.transitions} transitions)",
+                style="green" if task.same else "red",
+            )
+        )
+        lines.extend(Text(f"      {difference}", style="red") for difference in task.differences)
+    return Group(*lines)
+
+
+def log_summary(found: LogInfo) -> Group:
+    """What a log holds."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("channel", "messages", "encoding", "schema"):
+        table.add_column(name, overflow="fold")
+    for each in sorted(found.channels, key=lambda channel: -channel.messages):
+        table.add_row(each.key, f"{each.messages:,}", each.encoding, each.schema or "–")
+    head = Text(
+        f"{found.path}: {found.messages:,} messages in {found.duration_s:.1f} s, {found.size_bytes:,} bytes", style="bold"
+    )
+    notes = [Text(f"! {problem}", style="yellow") for problem in found.problems]
+    if found.recovered:
+        notes.append(Text("! the file was not finished; all whole chunks of it were read", style="yellow"))
+    if found.dropped:
+        notes.append(Text(f"! the recorder could not write {found.dropped:,} messages", style="yellow"))
+    return Group(head, *notes, table)
+
+
+def image_table(images: Sequence[ImageState]) -> Table:
+    """Images of the catalogue, a line each."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("image", "reference", "state", "size"):
+        table.add_column(name, overflow="fold")
+    for each in images:
+        size = f"{each.size_bytes / 2**20:.0f} MiB" if each.size_bytes else "–"
+        table.add_row(each.name, each.reference, "built" if each.present else "not built", size)
+    return table
+
+
+def check_table(checks: Sequence[Check]) -> Group:
+    """Checks of this machine; a failed one with its remedy."""
+    lines: list[Text] = []
+    for check in checks:
+        mark, style = ("ok", "green") if check.ok else ("FAIL", "red") if check.required else ("note", "yellow")
+        lines.append(Text.assemble((f"{mark:>4}", style), f"  {check.name}: {check.detail}"))
+        if not check.ok and check.remedy:
+            lines.append(Text(f"      remedy: {check.remedy}"))
+    return Group(*lines)
+
+
+def bench_table(result: Mapping[str, Any]) -> Table:
+    """Figures of a benchmark, a line each; nested ones by their path."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+
+    def add(prefix: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key, each in value.items():  # pyright: ignore[reportUnknownVariableType]
+                add(f"{prefix}.{key}" if prefix else str(key), each)  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            table.add_row(prefix, f"{value:.3f}" if isinstance(value, float) else str(value))
+
+    add("", result)
+    return table

@@ -1,0 +1,113 @@
+"""The main job, once through on a local fleet: instructions in, plans, live progress, results, log, replay.
+
+It is what a newcomer runs first, so it checks what it shows: it succeeds only if every task succeeded and the
+replayed log ends in the same states.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.text import Text
+
+from appliance import console, local_fleet
+from appliance.client import FleetClient
+from appliance.errors import SwiftbotError
+from appliance.local_fleet import FleetState, Order
+from appliance.model import SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.tasks.replay import ReplayReport, replay
+
+INSTRUCTIONS = (
+    "Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator",
+    "Drone_1 take off to 10 m, go to goal 2 and land, while Rover_1 fetches the red box from dock 3 "
+    "and places it at dock 2",
+)
+"""One sequential for one robot, one with two robots in parallel."""
+
+
+async def run(order: Order, *, asks: Sequence[str], tui: bool = False, keep: bool = False) -> bool:
+    """Run the demonstration; True only if all of it went well.
+
+    Args:
+        order: the fleet to start.
+        asks: instructions beside its own two.
+        tui: open the terminal UI on the running fleet afterwards.
+        keep: leave the fleet running.
+    """
+    began = time.monotonic()
+    with contextlib.suppress(SwiftbotError):
+        await local_fleet.down(order.directory, progress=_say)
+    log_files = set((order.directory / "record").glob("*.mcap"))
+    state = await local_fleet.up(order, progress=_say)
+    good = True
+    try:
+        async with FleetClient(state.endpoint) as client:
+            console.out.print(console.gateway_table(sorted(client.plane.registry.gateways.values(), key=lambda g: g.id)))
+            for ask in (*INSTRUCTIONS, *asks):
+                record = await _one(client, ask)
+                good = good and record.state is TaskState.SUCCEEDED
+        if tui:
+            from appliance.tui.app import run_tui  # noqa: PLC0415 - Textual is only wanted here
+
+            await run_tui(state.endpoint.connect, fleet=state.fleet)
+    finally:
+        if keep:
+            _say(f"the fleet goes on: `swiftbot --help`; end it with `swiftbot down --dir {order.directory}`")
+            await asyncio.sleep(1.5)
+        else:
+            await local_fleet.down(order.directory, progress=_say)
+    reports = _replay(state, log_files)
+    good = good and bool(reports) and all(report.same for report in reports)
+    verdict = "all succeeded, and the replayed log ends in the same states" if good else "NOT all of it went well"
+    console.out.print(
+        Text(f"{verdict} ({time.monotonic() - began:.1f} s)", style="bold green" if good else "bold red")
+    )
+    return good
+
+
+def _say(text: str) -> None:
+    console.out.print(Text(f"· {text}", style="dim"))
+
+
+async def _one(client: FleetClient, instruction: str) -> TaskRecord:
+    """Submit one instruction, show its plan, its progress and its results."""
+    console.out.rule(style="dim")
+    console.out.print(Text(f"“{instruction}”", style="bold"))
+    accepted = await client.submit(TaskRequest(instruction=instruction, submitter="demo"))
+    return await follow(client, accepted.id)
+
+
+async def follow(client: FleetClient, task: str) -> TaskRecord:
+    """Show a task's plan, each change of a subtask, and the results at its end; returns its last record."""
+    shown_plan = False
+    told: dict[str, tuple[SubtaskState, str, int]] = {}
+    record: TaskRecord | None = None
+    async for record in client.watch(task):
+        if record.plan is not None and record.subtasks and not shown_plan:
+            shown_plan = True
+            console.out.print(console.plan_graph(record.plan))
+        for each in record.subtasks:
+            # Whole tenths of progress: a line a step, not one a message.
+            news = (each.state, each.note if not each.progress else "", int(each.progress * 10) // 3)
+            if told.get(each.subtask.id, (SubtaskState.WAITING, "", 0)) != news:
+                told[each.subtask.id] = news
+                console.out.print(console.progress_line(each), style="dim")
+    assert record is not None  # noqa: S101 - watch yields at least the final record
+    console.out.print(console.task_table(record))
+    return record
+
+
+def _replay(state: FleetState, before: set[Path]) -> list[ReplayReport]:
+    reports: list[ReplayReport] = []
+    for path in sorted(set(Path(state.record_dir).glob("*.mcap")) - before):
+        console.out.print(f"log: {path} ({path.stat().st_size:,} bytes)")
+        try:
+            report = replay(path)
+        except SwiftbotError as error:
+            console.out.print(Text(f"  {error}", style="red"))
+            continue
+        console.out.print(console.replay_summary(report))
+        reports.append(report)
+    return reports

@@ -1,0 +1,123 @@
+"""Coarse scheduling: which gateway, and which robot behind `any`."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, Subtask, SubtaskRecord
+from appliance.tasks.placement import bind, place
+from appliance.tasks.settings import TasksConfig
+
+NEED = Need(image="base")
+
+
+def status(name: str, **fields: object) -> GatewayStatus:
+    """Return a gateway's status."""
+    return GatewayStatus(id=name, fleet="f", **fields)  # type: ignore[arg-type]
+
+
+def container(gateway: str, state: ContainerState = ContainerState.READY, image: str = "base") -> ContainerInfo:
+    """Return a container."""
+    return ContainerInfo(id=f"{gateway}-c", gateway=gateway, image=image, state=state)
+
+
+def order(gateways: list[GatewayStatus], *, warm: tuple[str, ...] = (), here: str = "gw-1", **fields: object) -> tuple[str, ...]:
+    """Place a subtask and return the order."""
+    arguments: dict[str, object] = {"holds": {}, "robot": None, "avoid": frozenset(), **fields}
+    return place(
+        NEED,
+        here=here,
+        gateways={each.id: each for each in gateways},
+        containers={name: {f"{name}-c": container(name)} for name in warm},
+        config=TasksConfig(),
+        **arguments,  # type: ignore[arg-type]
+    ).order
+
+
+def test_warm_and_idle_gateways_come_first() -> None:
+    """A ready container outweighs a little load, and equal gateways go to the one that asks."""
+    gateways = [status("gw-1", load=0.1), status("gw-2", load=0.3), status("gw-3", load=0.1)]
+    assert order(gateways, warm=("gw-2",))[0] == "gw-2"
+    assert order(gateways, here="gw-3")[0] == "gw-3"
+
+
+def test_draining_and_broken_gateways_are_no_candidates() -> None:
+    """A draining gateway is never chosen; one without Podman only while it has warm containers."""
+    gateways = [status("gw-1", draining=True), status("gw-2", pool_problem="Podman does not answer")]
+    assert order(gateways) == ()
+    assert order(gateways, warm=("gw-1", "gw-2")) == ("gw-2",)
+
+
+def test_gateways_where_it_failed_come_last() -> None:
+    """A retry goes elsewhere while there is an elsewhere."""
+    gateways = [status("gw-1"), status("gw-2", load=0.9)]
+    assert order(gateways, warm=("gw-1",), avoid=frozenset({"gw-1"})) == ("gw-2", "gw-1")
+
+
+def test_work_goes_to_its_robots_link_and_to_its_data() -> None:
+    """Without input files the robot's gateway is near; with them, whoever holds them."""
+    gateways = [status("gw-1"), status("gw-2"), status("gw-3")]
+    robot = RobotInfo(id="drone_1", kind="mavlink", gateway="gw-2")
+    assert order(gateways, robot=robot)[0] == "gw-2"
+    assert order(gateways, robot=robot, holds={"gw-3": 1.0})[0] == "gw-3"
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["a", "b", "c", "d"]),
+        st.tuples(st.floats(-1, 2), st.booleans(), st.booleans(), st.booleans()),
+        min_size=1,
+    )
+)
+def test_every_able_gateway_is_in_the_order_once(fleet: dict[str, tuple[float, bool, bool, bool]]) -> None:
+    """No able gateway is forgotten, none that is not is named, whatever the loads."""
+    gateways = [
+        status(name, load=load, draining=drains, pool_problem="x" if broken else "")
+        for name, (load, drains, broken, _) in fleet.items()
+    ]
+    warm = tuple(name for name, row in fleet.items() if row[3])
+    able = {name for name, (_, drains, broken, has) in fleet.items() if not drains and (has or not broken)}
+    found = order(gateways, warm=warm)
+    assert set(found) == able
+    assert len(found) == len(able)
+
+
+ROVER = RobotInfo(id="rover_1", kind="zenoh", uses=("base", "arm", "camera"), verbs=("goto", "pick", "capture"))
+DRONE = RobotInfo(id="drone_1", kind="mavlink", uses=("base",), verbs=("goto", "takeoff"), flies=True)
+ROBOTS = {each.id: each for each in (ROVER, DRONE)}
+
+
+def records(*subtasks: Subtask) -> tuple[SubtaskRecord, ...]:
+    """Wrap subtasks."""
+    return tuple(SubtaskRecord(subtask=each) for each in subtasks)
+
+
+def test_any_is_a_robot_that_can_do_all_that_its_label_must() -> None:
+    """`any` that goes somewhere and picks needs one robot with base and arm for both."""
+    these = records(Subtask(id="s1", skill="goto", robot="any"), Subtask(id="s2", skill="pick", robot="any"))
+    uses = {"s1": ("base",), "s2": ("arm",)}
+    verbs = {"s1": ("goto",), "s2": ("pick",)}
+    assert bind("any", these, robots=ROBOTS, uses=uses, verbs=verbs, busy=frozenset()) == ("rover_1", "")
+
+
+def test_any_prefers_a_robot_that_is_free() -> None:
+    """Of two that can, the idle one."""
+    these = records(Subtask(id="s1", skill="goto", robot="any"))
+    found = bind("any", these, robots=ROBOTS, uses={"s1": ("base",)}, verbs={"s1": ("goto",)}, busy=frozenset({"drone_1"}))
+    assert found == ("rover_1", "")
+
+
+def test_two_labels_are_two_robots() -> None:
+    """`any1` and `any2` do not become the same robot while another can."""
+    first = SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="any1"), bound_robot="drone_1")
+    second = SubtaskRecord(subtask=Subtask(id="s2", skill="goto", robot="any2"))
+    arguments = {"uses": {"s1": ("base",), "s2": ("base",)}, "verbs": {}, "busy": frozenset[str]()}
+    assert bind("any2", (first, second), robots=ROBOTS, **arguments) == ("rover_1", "")  # type: ignore[arg-type]
+    assert bind("any1", (first, second), robots=ROBOTS, **arguments) == ("drone_1", "")  # type: ignore[arg-type]
+
+
+def test_an_absent_robot_is_waited_for_by_name() -> None:
+    """The reason for the wait names the robot."""
+    these = records(Subtask(id="s1", skill="goto", robot="rover_9"))
+    robot, reason = bind("rover_9", these, robots=ROBOTS, uses={}, verbs={}, busy=frozenset())
+    assert robot is None
+    assert "rover_9" in reason
