@@ -126,7 +126,7 @@ def load_catalogue(extra: Sequence[Path] = ()) -> Catalogue:
 
 
 def image_reference(image: str, *, folder: Path | None = None) -> str:
-    """Return `localhost/swiftbot/<image>:<hash>`; the hash is of the image's folder, so a change is a new image.
+    """Return `localhost/swiftbot/<image>:<hash>`; a change of the image's folder or of the common recipe is a new image.
 
     Args:
         image: name of a folder of `images/`.
@@ -138,7 +138,7 @@ def image_reference(image: str, *, folder: Path | None = None) -> str:
     where = folder or SKILLS / "images" / image
     if not (where / "image.toml").is_file():
         raise ConfigError(f"no image {image!r}: {where}/image.toml is missing", remedy="see docs/skills.md, Images")
-    digest = hashlib.sha256()
+    digest = hashlib.sha256((SKILLS / "images" / "recipe.toml").read_bytes())
     for file in sorted(where.rglob("*")):
         if file.is_file() and "__pycache__" not in file.parts and not file.name.startswith("."):
             data = file.read_bytes()
