@@ -21,6 +21,7 @@ from appliance import console, logs
 from appliance.client import Endpoint, FleetClient
 from appliance.errors import ConfigError, SwiftbotError
 from appliance.model import TaskRecord, TaskRequest, TaskState
+from appliance.tasks.view import view
 
 DAEMONS = Group("Daemons", sort_key=3)
 FLEET = Group("A fleet on this machine", sort_key=1)
@@ -340,7 +341,7 @@ def submit(
 
     record = asyncio.run(go())
     if as_json or not wait:
-        show(record, as_json=as_json, table=console.task_table(record))
+        show(view(record), as_json=as_json, table=console.task_table(record))
     return _outcome(record)
 
 
@@ -363,7 +364,7 @@ def task_list(*, limit: int = 20, as_json: Json = False, where: Where = HERE) ->
             found = await client.tasks(limit)
         for each in found.unreachable:
             console.err.print(f"{each} did not answer; its tasks may be missing")
-        show(found, as_json=as_json, table=console.task_list(found.tasks))
+        show([view(each) for each in found.tasks], as_json=as_json, table=console.task_list(found.tasks))
 
     asyncio.run(go())
     return 0
@@ -376,7 +377,7 @@ def task_show(task: str, *, as_json: Json = False, where: Where = HERE) -> int:
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             record = await client.task(task)
-        show(record, as_json=as_json, table=console.task_table(record))
+        show(view(record), as_json=as_json, table=console.task_table(record))
 
     asyncio.run(go())
     return 0
@@ -393,7 +394,7 @@ def task_cancel(task: str, *, as_json: Json = False, where: Where = HERE) -> int
                 console.err.print(f"task {task} is being cancelled")
             async for record in client.watch(task):  # noqa: B007 - the last one is shown
                 pass
-        show(record, as_json=as_json, table=console.task_table(record))
+        show(view(record), as_json=as_json, table=console.task_table(record))
 
     asyncio.run(go())
     return 0

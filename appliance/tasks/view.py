@@ -1,0 +1,93 @@
+"""A task as tools want it: flat, with every field there, so that `jq` needs no cases.
+
+The record in the DHT is shaped for the state machine; this is what `submit --json` and `task show --json` print.
+"""
+
+from typing import Any
+
+from msgspec import Struct
+
+from appliance.model import Failure, SubtaskRecord, TaskRecord
+
+
+class SubtaskView(Struct, frozen=True, kw_only=True):
+    """One subtask; None where there is nothing (yet)."""
+
+    id: str
+    skill: str
+    robot: str | None
+    params: dict[str, Any]
+    after: tuple[str, ...]
+    state: str
+    gateway: str | None
+    container: str | None
+    phase: str | None
+    startup_ms: float | None
+    """Ready to the first line of the handler."""
+    duration_ms: float | None
+    """First line of the handler to its result."""
+    attempts: int
+    progress: float
+    note: str
+    result: dict[str, Any] | None
+    error: Failure | None
+
+
+class TaskView(Struct, frozen=True, kw_only=True):
+    """A task; `tier` and `confidence` are the plan's, None before there is one."""
+
+    id: str
+    instruction: str
+    state: str
+    submitter: str
+    coordinator: str
+    domain: str | None
+    tier: str | None
+    confidence: float | None
+    plan_ms: float | None
+    created_ns: int
+    updated_ns: int
+    error: Failure | None
+    subtasks: tuple[SubtaskView, ...]
+
+
+def view(record: TaskRecord) -> TaskView:
+    """Flatten a record."""
+    plan = record.plan
+    return TaskView(
+        id=record.id,
+        instruction=record.instruction,
+        state=str(record.state),
+        submitter=record.submitter,
+        coordinator=record.coordinator,
+        domain=plan.domain if plan else None,
+        tier=str(plan.tier) if plan else None,
+        confidence=plan.confidence if plan else None,
+        plan_ms=plan.latency_ms if plan else None,
+        created_ns=record.created_ns,
+        updated_ns=record.updated_ns,
+        error=record.failure,
+        subtasks=tuple(_subtask(each) for each in record.subtasks),
+    )
+
+
+def _subtask(record: SubtaskRecord) -> SubtaskView:
+    subtask = record.subtask
+    return SubtaskView(
+        id=subtask.id,
+        skill=subtask.skill,
+        robot=record.bound_robot or subtask.robot,
+        params=subtask.params,
+        after=subtask.after,
+        state=str(record.state),
+        gateway=record.gateway or None,
+        container=record.container or None,
+        phase=str(record.phase) if record.phase else None,
+        startup_ms=record.startup_ms,
+        duration_ms=record.duration_ms,
+        attempts=record.attempt,
+        progress=record.progress,
+        note=record.note,
+        result=record.result,
+        error=record.failure,
+    )
