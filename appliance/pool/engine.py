@@ -1,0 +1,381 @@
+"""Everything this product asks of Podman, in one class: the seam to the outside, faked in unit tests.
+
+It exists because podman-py is synchronous, untyped and has sharp edges (each noted where it is avoided). All of
+it is confined here: calls run on a few worker threads, each with a client of its own, and whatever goes wrong
+comes out as one of two errors.
+
+    UnreachableError     the API socket is absent or does not answer
+    PoolError            Podman answered that it will not
+    PrerequisiteError    the image is not there
+
+Guarantees: a container is created with `--read-only`, no capability, no new privileges, no network, and files
+it makes in its bind-mounted folder belong to the service user (rootless: root inside is that user outside).
+"""
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, cast
+
+import podman
+import requests
+from msgspec import Struct
+from podman.errors import APIError, ImageNotFound, NotFound, PodmanError
+
+from appliance.errors import PoolError, PrerequisiteError, UnreachableError
+
+T = TypeVar("T")
+LIMITING = frozenset({"memory", "pids", "cpu"})
+"""cgroup controllers that must be delegated for limits to hold."""
+
+
+class EngineFacts(Struct, frozen=True, kw_only=True):
+    """What Podman says of itself."""
+
+    version: str
+    cgroup_version: str
+    controllers: frozenset[str]
+    runtime: str
+    storage_driver: str
+    rootless: bool
+
+    @property
+    def limits_enforced(self) -> bool:
+        """Whether memory, CPU and process limits hold: rootless that takes cgroup v2 with delegation."""
+        return self.cgroup_version == "v2" and self.controllers >= LIMITING
+
+
+class ContainerSpec(Struct, frozen=True, kw_only=True):
+    """A container to be made. `binds` are read-only unless in `writable`; `volumes` are named (name -> path)."""
+
+    name: str
+    image: str
+    command: tuple[str, ...]
+    labels: dict[str, str]
+    binds: dict[str, str]
+    writable: frozenset[str] = frozenset()
+    volumes: dict[str, str]
+    environment: dict[str, str]
+    cpu: float
+    memory_mb: int
+    pids: int
+    tmp_mb: int
+    runtime: str = ""
+    seccomp_profile: str = ""
+    limits: bool = False
+
+
+class Found(Struct, frozen=True, kw_only=True):
+    """A container that is there."""
+
+    id: str
+    name: str
+    running: bool
+    labels: dict[str, str]
+
+
+class FoundImage(Struct, frozen=True, kw_only=True):
+    """An image that is there."""
+
+    id: str
+    tags: tuple[str, ...]
+    size_mb: float
+    created: str
+
+
+class Engine(Protocol):
+    """What the pool asks of a container engine."""
+
+    async def facts(self) -> EngineFacts:
+        """Return what the engine is and can."""
+        ...
+
+    async def create(self, spec: ContainerSpec) -> str:
+        """Make a container and return its id."""
+        ...
+
+    async def start(self, container: str) -> None:
+        """Start it."""
+        ...
+
+    async def remove(self, container: str) -> None:
+        """Kill and remove it; nothing when it is gone already."""
+        ...
+
+    async def logs(self, container: str) -> str:
+        """Return the end of what it wrote."""
+        ...
+
+    async def containers(self, labels: Mapping[str, str]) -> list[Found]:
+        """Return the containers that have all these labels."""
+        ...
+
+    async def images(self) -> list[FoundImage]:
+        """Return all images with a tag of ours."""
+        ...
+
+    async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
+        """Make a named volume unless it is there."""
+        ...
+
+    def close(self) -> None:
+        """Let go of threads and connections."""
+        ...
+
+
+def socket_path(url: str = "") -> Path:
+    """Return the API socket's path: of `url`, or the user's own.
+
+    Raises:
+        PrerequisiteError: the url is no unix one, or none is given and XDG_RUNTIME_DIR is not set.
+    """
+    if url:
+        scheme, _, path = url.partition("://")
+        if scheme not in ("unix", "http+unix") or not path.startswith("/"):
+            raise PrerequisiteError(f"podman_url {url!r} is no socket", remedy="write it as unix:///path/podman.sock")
+        return Path(path)
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if not runtime:
+        raise PrerequisiteError(
+            "XDG_RUNTIME_DIR is not set, so Podman's API socket cannot be found",
+            remedy="run as the service user with lingering (loginctl enable-linger), or set pool.podman_url",
+        )
+    return Path(runtime) / "podman" / "podman.sock"
+
+
+class PodmanEngine:
+    """Podman through podman-py on the API socket of the user that runs this."""
+
+    def __init__(self, url: str = "", *, threads: int = 4, timeout_s: float = 60.0) -> None:
+        self.path = socket_path(url)
+        self._timeout_s = timeout_s
+        self._threads = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="podman")
+        self._local = threading.local()
+        self._clients: list[Any] = []
+
+    def _client(self) -> Any:  # podman-py is untyped in the parts used here
+        client = getattr(self._local, "client", None)
+        if client is None:
+            client = podman.PodmanClient(base_url=f"unix://{self.path}", timeout=int(self._timeout_s))
+            self._local.client = client
+            self._clients.append(client)
+        return client
+
+    async def _ask(self, what: str, work: Callable[[Any], T]) -> T:
+        def call() -> T:
+            try:
+                return work(self._client())
+            except ImageNotFound as error:
+                raise PrerequisiteError(f"{what}: the image is not there", remedy="swiftbot images build") from error
+            except APIError as error:
+                # podman-py raises this for a socket it cannot connect to as well, then without a response.
+                if error.response is None:
+                    raise self._unreachable(error) from error
+                raise PoolError(f"{what}: {error.explanation or error}") from error
+            except (requests.RequestException, OSError) as error:
+                raise self._unreachable(error) from error
+            except (PodmanError, ValueError, KeyError) as error:
+                raise PoolError(f"{what}: {error}") from error
+
+        return await asyncio.get_running_loop().run_in_executor(self._threads, call)
+
+    def _unreachable(self, error: Exception) -> UnreachableError:
+        why = "is not there" if not self.path.exists() else f"does not answer ({type(error).__name__})"
+        return UnreachableError(
+            f"Podman's API socket {self.path} {why}",
+            remedy="systemctl --user enable --now podman.socket, as the service user",
+        )
+
+    async def facts(self) -> EngineFacts:
+        """Return what this Podman is and can."""
+
+        def work(client: Any) -> EngineFacts:
+            info = cast("dict[str, Any]", client.info())
+            host = info["host"]
+            return EngineFacts(
+                version=str(info.get("version", {}).get("Version", "")),
+                cgroup_version=str(host.get("cgroupVersion", "")),
+                controllers=frozenset(host.get("cgroupControllers") or ()),
+                runtime=str(host.get("ociRuntime", {}).get("name", "")),
+                storage_driver=str(info.get("store", {}).get("graphDriverName", "")),
+                rootless=bool(host.get("security", {}).get("rootless", False)),
+            )
+
+        return await self._ask("info", work)
+
+    async def create(self, spec: ContainerSpec) -> str:
+        """Make a container, not started; returns its id."""
+        arguments = create_arguments(spec)
+
+        def work(client: Any) -> str:
+            return str(client.containers.create(spec.image, list(spec.command), **arguments).id)
+
+        return await self._ask(f"create {spec.name} of {spec.image}", work)
+
+    async def start(self, container: str) -> None:
+        """Start a container."""
+
+        def work(client: Any) -> None:
+            client.api.post(f"/containers/{container}/start").raise_for_status()
+
+        await self._ask(f"start {container[:12]}", work)
+
+    async def remove(self, container: str) -> None:
+        """Kill and remove a container: `remove(force=True)` alone waits 10 s for one that ignores SIGTERM."""
+
+        def work(client: Any) -> None:
+            # 404: gone already; 409: not running.
+            client.api.post(f"/containers/{container}/kill", params={"signal": "KILL"})
+            response = client.api.delete(f"/containers/{container}", params={"force": True, "v": False, "timeout": 0})
+            if response.status_code != requests.codes.not_found:
+                response.raise_for_status()
+
+        await self._ask(f"remove {container[:12]}", work)
+
+    async def logs(self, container: str) -> str:
+        """Return the last lines a container wrote, at most 2,000 characters."""
+
+        def work(client: Any) -> str:
+            parts = client.containers.get(container).logs(stdout=True, stderr=True, tail=30)
+            data = parts if isinstance(parts, bytes) else b"".join(parts)
+            return data.decode("utf-8", "replace")[-2000:].strip()
+
+        try:
+            return await self._ask(f"logs of {container[:12]}", work)
+        except (PoolError, UnreachableError, PrerequisiteError):
+            return ""
+
+    async def containers(self, labels: Mapping[str, str]) -> list[Found]:
+        """Return the containers, running or not, that have all these labels."""
+        wanted = [f"{key}={value}" for key, value in labels.items()]
+
+        def work(client: Any) -> list[Found]:
+            # Through the API itself: containers.list() inspects each one again.
+            response = client.api.get("/containers/json", params={"all": True, "filters": {"label": wanted}})
+            response.raise_for_status()
+            return [
+                Found(
+                    id=each["Id"],
+                    name=(each.get("Names") or [""])[0],
+                    running=each.get("State") == "running",
+                    labels=each.get("Labels") or {},
+                )
+                for each in response.json()
+            ]
+
+        return await self._ask("list containers", work)
+
+    async def images(self) -> list[FoundImage]:
+        """Return the images that have a tag."""
+
+        def work(client: Any) -> list[FoundImage]:
+            response = client.api.get("/images/json")
+            response.raise_for_status()
+            return [
+                FoundImage(
+                    id=str(each["Id"])[:12],
+                    tags=tuple(each.get("RepoTags") or ()),
+                    size_mb=round(each.get("Size", 0) / 2**20, 1),
+                    created=str(each.get("Created", "")),
+                )
+                for each in response.json()
+                if each.get("RepoTags")
+            ]
+
+        return await self._ask("list images", work)
+
+    async def import_image(self, archive: Path, reference: str) -> str:
+        """Make an image of a root filesystem's tar archive and return its id."""
+
+        def work(client: Any) -> str:
+            with archive.open("rb") as body:
+                response = client.api.post(
+                    "/images/import",
+                    params={"reference": reference},
+                    data=body,
+                    headers={"content-type": "application/x-tar"},
+                    timeout=600,
+                )
+            response.raise_for_status()
+            return str(response.json()["Id"])
+
+        return await self._ask(f"import {reference}", work)
+
+    async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
+        """Make a named volume unless it is there."""
+
+        def work(client: Any) -> None:
+            if not client.volumes.exists(name):
+                client.volumes.create(name, labels=dict(labels))
+
+        try:
+            await self._ask(f"volume {name}", work)
+        except PoolError as error:
+            if "already exists" not in error.message:  # another start of this pool made it just now
+                raise
+
+    async def remove_volumes(self, labels: Mapping[str, str]) -> None:
+        """Remove the named volumes that have all these labels and that no container uses."""
+        wanted = [f"{key}={value}" for key, value in labels.items()]
+
+        def work(client: Any) -> None:
+            response = client.api.get("/volumes/json", params={"filters": {"label": wanted}})
+            response.raise_for_status()
+            for each in response.json() or ():
+                client.api.delete(f"/volumes/{each['Name']}")
+
+        await self._ask("remove volumes", work)
+
+    def close(self) -> None:
+        """Let go of threads and connections; a call in progress is waited for."""
+        self._threads.shutdown(wait=True, cancel_futures=True)
+        for client in self._clients:
+            client.close()
+        self._clients.clear()
+
+
+def create_arguments(spec: ContainerSpec) -> dict[str, Any]:
+    """Return podman-py's arguments for a container (pure; see the traps in the comments)."""
+    mounts: list[dict[str, Any]] = [
+        {"type": "bind", "source": source, "target": target, "read_only": source not in spec.writable}
+        for source, target in spec.binds.items()
+    ]
+    # `tmpfs=` is refused by podman-py: a mount does it. Executables there are nobody's business but the handler's.
+    mounts.append({"type": "tmpfs", "target": "/tmp", "source": "tmpfs", "size": f"{spec.tmp_mb}m", "mode": "1777"})  # noqa: S108 - inside the container
+    arguments: dict[str, Any] = {
+        "name": spec.name,
+        "labels": spec.labels,
+        "environment": spec.environment,
+        "working_dir": "/",
+        "user": "0:0",
+        "read_only": True,
+        "read_write_tmpfs": False,
+        "cap_drop": ["all"],
+        # `security_opt` is sent under the wrong name: these two are sent as they should be.
+        "no_new_privileges": True,
+        "network_mode": "none",
+        "ipc_mode": "private",
+        "mounts": mounts,
+        "volumes": {name: {"bind": target, "mode": "rw"} for name, target in spec.volumes.items()},
+        "init": False,
+        "stop_timeout": 3,
+        "log_config": {"Type": "k8s-file", "Config": {"size": 2**20}},
+        "shm_size": "16m",
+    }
+    if spec.seccomp_profile:
+        arguments["seccomp_profile_path"] = spec.seccomp_profile
+    if spec.runtime:
+        arguments["runtime"] = spec.runtime
+    if spec.limits:
+        period = 100_000  # microseconds
+        arguments |= {
+            "pids_limit": spec.pids,
+            "mem_limit": spec.memory_mb * 2**20,
+            "memswap_limit": spec.memory_mb * 2**20,
+            "cpu_period": period,
+            "cpu_quota": int(spec.cpu * period),
+        }
+    return arguments

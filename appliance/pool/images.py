@@ -1,0 +1,219 @@
+"""Builds and lists the images that skills run in.
+
+It exists because a gateway often has no image registry in reach: the root filesystem is made of the host's own
+Debian packages by `mmdebstrap` in a user namespace (no root needed) and imported through the Podman API. Where a
+base image is configured, the image's Containerfile is built on it instead. An image's tag is a hash of all that
+goes into it, so building again is a look at the list.
+"""
+
+import asyncio
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+import tomllib
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import NotFoundError, PrerequisiteError
+from appliance.pool.engine import PodmanEngine
+from appliance.pool.settings import PoolConfig
+from appliance.pool.sources import host_sources
+from appliance.skills.catalogue import SKILLS, Catalogue, ImageSpec, image_reference
+
+log = structlog.get_logger(__name__)
+
+RECIPE = SKILLS / "images" / "recipe.toml"
+BUILD_TIMEOUT_S = 900.0
+"""A slow mirror needs minutes; beyond this it hangs."""
+Progress = Callable[[str], None]
+
+
+class BuiltImage(Struct, frozen=True, kw_only=True):
+    """An image of the catalogue as it stands on this machine. `seconds` is 0 when it was there already."""
+
+    name: str
+    reference: str
+    present: bool
+    size_mb: float = 0.0
+    seconds: float = 0.0
+
+
+def base_image(config: PoolConfig) -> str:
+    """Return the registry's base image: $SWIFTBOT_BASE_IMAGE before the configuration; empty for none."""
+    return os.environ.get("SWIFTBOT_BASE_IMAGE", "") or config.base_image
+
+
+def reference(spec: ImageSpec, config: PoolConfig) -> str:
+    """Return the full name of an image: `localhost/swiftbot/<name>:<hash of what goes into it>`."""
+    name = image_reference(spec.name, folder=spec.folder)
+    base = base_image(config)
+    if not base:
+        return name
+    repository, _, tag = name.rpartition(":")
+    return f"{repository}:{hashlib.sha256(f'{tag} on {base}'.encode()).hexdigest()[:12]}"
+
+
+def _spec(name: str, catalogue: Catalogue) -> ImageSpec:
+    spec = catalogue.images.get(name)
+    if spec is None:
+        raise NotFoundError(f"no image {name!r}", remedy=f"known: {', '.join(sorted(catalogue.images))}")
+    return spec
+
+
+async def list_images(catalogue: Catalogue, config: PoolConfig) -> list[BuiltImage]:
+    """Return every image of the catalogue and whether it is there.
+
+    Raises:
+        UnreachableError: Podman does not answer.
+    """
+    engine = PodmanEngine(config.podman_url, threads=1)
+    try:
+        sizes = {tag: each.size_mb for each in await engine.images() for tag in each.tags}
+    finally:
+        engine.close()
+    return [
+        BuiltImage(name=name, reference=full, present=full in sizes, size_mb=sizes.get(full, 0.0))
+        for name, spec in catalogue.images.items()
+        for full in (reference(spec, config),)
+    ]
+
+
+def _ignore(line: str) -> None:
+    del line
+
+
+async def build(
+    name: str, catalogue: Catalogue, config: PoolConfig, *, progress: Progress = _ignore, force: bool = False
+) -> BuiltImage:
+    """Build one image unless it is there.
+
+    Args:
+        name: image of the catalogue.
+        catalogue: where its packages are listed.
+        config: names Podman's socket and, perhaps, a base image.
+        progress: called with each line of the build's log.
+        force: build it again even so.
+
+    Raises:
+        NotFoundError: no such image.
+        PrerequisiteError: it cannot be built; the message ends with the end of the log.
+        UnreachableError: Podman does not answer.
+    """
+    spec = _spec(name, catalogue)
+    full = reference(spec, config)
+    begun = time.monotonic()
+    engine = PodmanEngine(config.podman_url, threads=1)
+    try:
+        sizes = {tag: each.size_mb for each in await engine.images() for tag in each.tags}
+        if full in sizes and not force:
+            progress(f"{full} is there")
+            return BuiltImage(name=name, reference=full, present=True, size_mb=sizes[full])
+        progress(f"building {full}")
+        base = base_image(config)
+        if base:
+            await _from_registry(spec, full, base, progress)
+        else:
+            await _from_packages(spec, full, engine, progress)
+        sizes = {tag: each.size_mb for each in await engine.images() for tag in each.tags}
+    finally:
+        engine.close()
+    built = BuiltImage(
+        name=name,
+        reference=full,
+        present=full in sizes,
+        size_mb=sizes.get(full, 0.0),
+        seconds=round(time.monotonic() - begun, 1),
+    )
+    progress(f"{full}: {built.size_mb:.0f} MB in {built.seconds:.0f} s")
+    return built
+
+
+async def _run(what: str, command: Sequence[str], progress: Progress, *, remedy: str) -> None:
+    """Run a build step; PrerequisiteError with the log's tail when it fails."""
+    if shutil.which(command[0]) is None:
+        raise PrerequisiteError(f"{what}: {command[0]} is not installed", remedy=f"apt-get install {command[0]}")
+    tail: deque[str] = deque(maxlen=15)
+    process = await asyncio.create_subprocess_exec(
+        *command, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+    )
+
+    async def follow() -> int:
+        assert process.stdout is not None  # noqa: S101 - it was asked for above
+        async for raw in process.stdout:
+            line = raw.decode("utf-8", "replace").rstrip()[:500]
+            tail.append(line)
+            progress(line)
+        return await process.wait()
+
+    try:
+        status = await asyncio.wait_for(follow(), BUILD_TIMEOUT_S)
+    except (TimeoutError, asyncio.CancelledError) as error:
+        process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), 10.0)
+        except TimeoutError:
+            process.kill()
+        if isinstance(error, asyncio.CancelledError):
+            raise
+        raise PrerequisiteError(f"{what} did not end within {BUILD_TIMEOUT_S:.0f} s", remedy=remedy) from error
+    if status:
+        text = "\n".join(tail)
+        raise PrerequisiteError(f"{what} failed with status {status}; the end of its log:\n{text}\n", remedy=remedy)
+
+
+async def _from_registry(spec: ImageSpec, full: str, base: str, progress: Progress) -> None:
+    file = spec.folder / "Containerfile"
+    if not file.is_file():
+        raise PrerequisiteError(
+            f"{file} is missing, so {spec.name} cannot be built on {base}", remedy="write it with ARG BASE"
+        )
+    arguments = ("--build-arg", f"BASE={base}", "--build-arg", f"PACKAGES={' '.join(spec.packages)}")
+    command = ("podman", "build", "--tag", full, *arguments, "--file", str(file), str(spec.folder))
+    remedy = f"check that {base} can be pulled and that its packages include {', '.join(spec.packages)}"
+    await _run(f"building {spec.name} on {base}", command, progress, remedy=remedy)
+
+
+async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, progress: Progress) -> None:
+    recipe = tomllib.loads(RECIPE.read_text(encoding="utf-8"))
+    release, sources = await asyncio.to_thread(host_sources)
+    with tempfile.TemporaryDirectory(prefix="swiftbot-image-") as folder:
+        list_file = Path(folder) / "sources.list"
+        list_file.write_text("\n".join(sources) + "\n", encoding="utf-8")
+        archive = Path(folder) / "root.tar"
+        command = [
+            "mmdebstrap",
+            "--mode=unshare",
+            "--format=tar",
+            f"--variant={recipe['variant']}",
+            f"--include={','.join(spec.packages)}",
+            *(f"--dpkgopt=path-exclude={pattern}" for pattern in recipe["exclude"]),
+            *await _proxies(),
+            release,
+            str(archive),
+            str(list_file),
+        ]
+        remedy = (
+            f"check that each of {', '.join(spec.packages)} is a package of {release}, that the machine's apt sources"
+            " answer, and that the user has a range in /etc/subuid and /etc/subgid"
+        )
+        await _run(f"building {spec.name} from Debian packages", command, progress, remedy=remedy)
+        progress(f"importing {archive.stat().st_size / 2**20:.0f} MB")
+        await engine.import_image(archive, full)
+
+
+async def _proxies() -> list[str]:
+    """Return the host's apt proxy settings: mmdebstrap starts from none of the host's configuration."""
+    if shutil.which("apt-config") is None:
+        return []
+    process = await asyncio.create_subprocess_exec(
+        "apt-config", "dump", "Acquire::http::Proxy", "Acquire::https::Proxy", stdout=asyncio.subprocess.PIPE
+    )
+    output, _ = await process.communicate()
+    lines = (line.strip() for line in output.decode("utf-8", "replace").splitlines())
+    return [f"--aptopt={line}" for line in lines if line.startswith("Acquire::http") and '""' not in line]

@@ -1,0 +1,84 @@
+"""The wire between gateway and runner: a four-byte big-endian length, then one JSON object.
+
+It exists on its own because the zygote, the child and the tests speak it. Bytes anywhere in a value travel as
+`{"$b64": "..."}`, so a handler hands pictures over and gets files back without knowing of JSON.
+"""
+
+import base64
+import binascii
+import json
+from typing import Any
+
+MAX_FRAME = 16 * 2**20
+"""Longest frame in bytes; a longer one is refused before it is read."""
+
+BYTES_TAG = "$b64"
+
+
+class FrameError(Exception):
+    """The other side sent something that is no frame."""
+
+
+def _pack(value: Any) -> Any:
+    """Turn bytes into their tagged form; `json` calls this for whatever it does not know."""
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return {BYTES_TAG: base64.b64encode(value).decode("ascii")}
+    raise TypeError(f"{type(value).__name__} cannot be sent: use dict, list, str, numbers, bool, None or bytes")
+
+
+def _unpack(value: dict[str, Any]) -> Any:
+    if len(value) == 1 and isinstance(value.get(BYTES_TAG), str):
+        return base64.b64decode(value[BYTES_TAG], validate=True)
+    return value
+
+
+def encode(value: dict[str, Any]) -> bytes:
+    """Return the frame of one object.
+
+    Raises:
+        TypeError, ValueError: it holds something JSON cannot say (a class, NaN).
+        FrameError: it is longer than MAX_FRAME.
+    """
+    body = json.dumps(value, default=_pack, allow_nan=False, separators=(",", ":")).encode()
+    if len(body) > MAX_FRAME:
+        raise FrameError(f"frame of {len(body)} bytes, {MAX_FRAME} allowed")
+    return len(body).to_bytes(4, "big") + body
+
+
+class Decoder:
+    """Collects bytes and gives whole objects."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an unfinished frame."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> None:
+        """Add what was received."""
+        self._buffer += data
+
+    def next(self) -> dict[str, Any] | None:
+        """Return the next whole object, or None while there is none.
+
+        Raises:
+            FrameError: too long, not JSON, or not an object. Nothing after it can be trusted.
+        """
+        if len(self._buffer) < 4:
+            return None
+        length = int.from_bytes(self._buffer[:4], "big")
+        if length > MAX_FRAME:
+            raise FrameError(f"frame of {length} bytes, {MAX_FRAME} allowed")
+        if len(self._buffer) < 4 + length:
+            return None
+        body = bytes(self._buffer[4 : 4 + length])
+        del self._buffer[: 4 + length]
+        try:
+            value: Any = json.loads(body, object_hook=_unpack)
+        except (ValueError, RecursionError, binascii.Error) as error:
+            raise FrameError(f"not JSON: {error}") from error
+        if not isinstance(value, dict):
+            raise FrameError(f"not an object but {type(value).__name__}")
+        return value

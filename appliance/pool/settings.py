@@ -1,0 +1,88 @@
+"""What can be set of the pool; the section `[pool]` of a gateway's file."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct, field
+
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class Weights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Weights of Score(c, T), together 1 (paper, Algorithm 1)."""
+
+    image: float = 0.5
+    """The right image matters most: a merely compatible one has not preloaded this skill."""
+    resources: float = 0.3
+    volumes: float = 0.2
+
+
+class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of one gateway's pool."""
+
+    mode: Literal["cold", "local", "federated"] = "federated"
+    """`cold`: a fresh container for every run, removed afterwards (the baseline to measure against). `local`: warm
+    containers of this gateway only. `federated`: those of other gateways too."""
+    capacity: Annotated[int, Meta(ge=1, le=256)] = 8
+    """Containers at most; each has a process (8 to 30 MB) and a conmon (2 MB) of its own."""
+    memory_mb: Annotated[int, Meta(ge=64)] = 4096
+    """Memory of all containers together, by what they are allowed, not by what they use."""
+    floor: dict[str, Annotated[int, Meta(ge=0, le=64)]] = field(default_factory=lambda: {"base": 2, "vision": 1})
+    """Containers of each image kept ready: two so that a second subtask finds one while the first is replaced."""
+    cpu: Positive = 1.0
+    """Cores of a container whose skills ask for less."""
+    container_memory_mb: Annotated[int, Meta(ge=32)] = 256
+    """Memory of a container whose skills ask for less."""
+    pids: Annotated[int, Meta(ge=8)] = 128
+    """Processes in a container: an ffmpeg has some 20 threads."""
+    user_processes: Annotated[int, Meta(ge=0)] = 2048
+    """Where pids cannot be limited by cgroup: processes of the whole user beyond which a run cannot fork."""
+    tmp_mb: Annotated[int, Meta(ge=4)] = 64
+    """Size of a container's /tmp, in memory."""
+    runtime: str = ""
+    """OCI runtime; empty: Podman's own with cgroup v2, runc with v1, where crun refuses."""
+    podman_url: str = ""
+    """API socket as `unix:///path`; empty: $XDG_RUNTIME_DIR/podman/podman.sock."""
+    seccomp_profile: str = ""
+    """Path of a seccomp profile; empty: Podman's default one."""
+    base_image: str = ""
+    """Base of a reachable registry for the images' Containerfiles; empty: made from the host's Debian packages."""
+
+    theta_match: float = 0.6
+    """A remote container needs at least this score (paper: theta_match)."""
+    gamma: float = 0.5
+    """A remote container may cost at most this part of a cold start (paper: gamma)."""
+    weights: Weights = field(default_factory=Weights)
+    cold_ms: Positive = 500.0
+    """What a cold start is thought to cost before one was measured here."""
+    remote_timeout_s: Positive = 0.3
+    """How long other gateways are asked for containers; beyond it a cold start would be quicker."""
+
+    lease_s: Positive = 5.0
+    """A selected container that is not used by then is free again."""
+    queue: Annotated[int, Meta(ge=0)] = 32
+    """Runs that may wait for a container when all are busy; more are refused."""
+    queue_wait_s: Positive = 30.0
+    """How long they wait."""
+    start_timeout_s: Positive = 20.0
+    """From create to the runner's answer; a loaded two-core machine has been seen to take 3 s."""
+    starts_at_once: Annotated[int, Meta(ge=1, le=16)] = 2
+    """Containers started at the same time in the background."""
+    cancel_grace_s: Positive = 2.0
+    """From asking a run to end to ending it."""
+    probe_s: Positive = 3.0
+    """How often each runner is pinged."""
+    probe_timeout_s: Positive = 2.0
+    probe_failures: Annotated[int, Meta(ge=1)] = 2
+    """Pings in a row without answer after which a container is replaced."""
+    idle_s: Positive = 600.0
+    """A ready container beyond the floor that nobody used for so long is removed."""
+    max_runs: Annotated[int, Meta(ge=1)] = 200
+    """A container is replaced after so many runs."""
+    max_growth_mb: Positive = 64.0
+    """A container whose runner has grown by so much since its start is replaced."""
+    bad_starts: Annotated[int, Meta(ge=1)] = 3
+    """Failed starts in a row after which an image is left alone for a while."""
+    quarantine_s: Positive = 60.0
+    """For how long."""
+    reconnect_s: Positive = 1.0
+    """First pause before a Podman that is not there is tried again; doubles up to 30 s."""
