@@ -126,7 +126,7 @@ def load_catalogue(extra: Sequence[Path] = ()) -> Catalogue:
 
 
 def image_reference(image: str, *, folder: Path | None = None) -> str:
-    """Return `localhost/swiftbot/<image>:<hash>`; a change of the image's folder or of the common recipe is a new image.
+    """Return `localhost/swiftbot/<image>:<hash>`: a changed image folder or common recipe is a new image.
 
     Args:
         image: name of a folder of `images/`.

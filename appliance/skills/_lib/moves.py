@@ -1,0 +1,132 @@
+"""Moves a robot: asks where it is, plans, sends the way, waits for arrival. Shared by all skills that go somewhere.
+
+The calls are made in the same order and number each time (state, take-off or state again, goto), because a
+call's number is part of the command's identity: a repeated attempt must meet its own earlier goto, nothing else.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from . import params, paths
+from .context import Context
+from .places import Spot
+
+CRUISE_M = 5.0
+"""Height a robot that flies climbs to when it is sent somewhere from the ground."""
+AIRBORNE_M = 0.5
+SLOWEST_MPS = 0.3
+"""What the time allowed for a way is reckoned with: a slow robot is not a lost one."""
+MAX_WAYPOINTS = 100
+"""What a robot takes in one command."""
+
+
+class State(NamedTuple):
+    """Where the robot is and what it can."""
+
+    x: float
+    y: float
+    z: float
+    flies: bool
+    verbs: tuple[str, ...]
+
+
+def state(ctx: Context) -> State:
+    """Ask the robot where it is; ctx.Fail when it does not know."""
+    info = ctx.command("state", timeout_s=10)
+    pose = params.table(info.get("pose"))
+    if not isinstance(info.get("pose"), dict):
+        raise ctx.Fail(
+            f"{ctx.robot} does not know where it is", "wait for its position fix, then try again", retryable=True
+        )
+    return State(
+        float(pose.get("x", 0.0)),
+        float(pose.get("y", 0.0)),
+        float(pose.get("z", 0.0)),
+        bool(info.get("flies", False)),
+        tuple(info.get("verbs") or ()),
+    )
+
+
+def speed(ctx: Context, *, default: float | None = None) -> float:
+    """Return the speed to go at, m/s: what was asked, never more than the site allows."""
+    limit = float(ctx.site.get("speed_limit_mps", 8.0))
+    asked = params.number(ctx, "speed_mps", default=limit if default is None else default, low=0.01, high=1000.0)
+    if asked > limit:
+        ctx.log(f"{asked:g} m/s is more than the site allows, going at {limit:g} m/s", asked=asked, limit=limit)
+    return min(asked, limit)
+
+
+def plan_way(ctx: Context, start: paths.Point, goal: Spot, *, flies: bool = False) -> list[paths.Point]:
+    """Return the waypoints to a spot around obstacles and forbidden areas; ctx.Fail when there is no way.
+
+    A robot that flies goes round obstacles too where it can (the map gives them no height), over them where the
+    start or the goal leaves no other way, and never over a forbidden area.
+    """
+    forbidden = paths.rectangles(ctx.site.get("forbidden") or ())
+    obstacles = paths.rectangles(ctx.site.get("obstacles") or ())
+    try:
+        try:
+            return paths.plan(start, (goal.x, goal.y), [*obstacles, *forbidden])
+        except paths.NoPath:
+            if not flies:
+                raise
+            return paths.plan(start, (goal.x, goal.y), forbidden)
+    except paths.NoPath as error:
+        raise ctx.Fail(f"cannot reach {goal.name}: {error.message}", error.remedy) from error
+
+
+def go(
+    ctx: Context, goals: Sequence[Spot], *, speed_mps: float, done: float = 0.0, share: float = 1.0
+) -> dict[str, Any]:
+    """Send the robot through spots, one after the other, and wait until it is at the last.
+
+    Args:
+        ctx: the run.
+        goals: where to, at least one.
+        speed_mps: at what speed.
+        done: progress before.
+        share: progress that this way is worth.
+
+    Returns:
+        `pose` at the end, `path_m`, `waypoints`.
+    """
+    before = state(ctx)
+    altitude = _climb(ctx, before, goals)
+    here: paths.Point = (before.x, before.y)
+    way: list[paths.Point] = []
+    waypoints: list[dict[str, float]] = []
+    for goal in goals:
+        leg = plan_way(ctx, here if not way else way[-1], goal, flies=before.flies)
+        if before.flies and goal.z > AIRBORNE_M:
+            altitude = goal.z
+        for x, y in leg:
+            waypoints.append({"x": round(x, 3), "y": round(y, 3)} | ({"z": round(altitude, 2)} if before.flies else {}))
+        way += leg
+    if len(waypoints) > MAX_WAYPOINTS:
+        raise ctx.Fail(f"the way has {len(waypoints)} turns, {MAX_WAYPOINTS} are possible", "go in several steps")
+    metres = paths.length([here, *way])
+    name = goals[-1].name
+    ctx.progress(done + 0.1 * share, f"going to {name}: {metres:.1f} m, {len(waypoints)} waypoints")
+    answer = ctx.command(
+        "goto", timeout_s=60 + metres / min(speed_mps, SLOWEST_MPS), waypoints=waypoints, speed_mps=speed_mps
+    )
+    ctx.progress(done + share, f"at {name}")
+    end = params.table(answer.get("pose")) or dict(waypoints[-1])
+    return {"pose": end, "path_m": round(metres, 2), "waypoints": waypoints}
+
+
+def _climb(ctx: Context, before: State, goals: Sequence[Spot]) -> float:
+    """See that a robot that flies is in the air; return the height to fly at."""
+    limit = float(ctx.site.get("altitude_limit_m", 60.0))
+    for goal in goals:
+        if goal.z > limit:
+            raise ctx.Fail(f"{goal.name} is {goal.z:g} m up, the site allows {limit:g} m", "choose a lower place")
+        if goal.z > AIRBORNE_M and not before.flies:
+            raise ctx.Fail(f"{goal.name} is {goal.z:g} m up and {ctx.robot} does not fly", "send a robot that flies")
+    altitude = min(before.z if before.z > AIRBORNE_M else CRUISE_M, limit)
+    if before.flies and before.z <= AIRBORNE_M and "takeoff" in before.verbs:
+        ctx.progress(0.02, f"climbing to {altitude:g} m")
+        ctx.command("takeoff", timeout_s=90, altitude_m=altitude)
+    elif before.flies:
+        state(ctx)  # keeps the number of calls: see above
+    return altitude

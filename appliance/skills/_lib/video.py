@@ -1,0 +1,22 @@
+"""Runs ffmpeg, which image `vision` has, with its errors turned into words."""
+
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from .context import Context
+
+
+def ffmpeg(ctx: Context, arguments: Sequence[str | Path], *, what: str, timeout_s: float = 240.0) -> None:
+    """Run ffmpeg in the run's scratch folder; ctx.Fail with its last words when it does not end well."""
+    # One thread: the container's process limit and the other containers' cores are shared.
+    command = ["ffmpeg", "-hide_banner", "-nostdin", "-loglevel", "error", "-y", "-threads", "1", *map(str, arguments)]
+    try:
+        done = subprocess.run(command, cwd=ctx.scratch, capture_output=True, timeout=timeout_s, check=False)
+    except FileNotFoundError as error:
+        raise ctx.Fail("there is no ffmpeg in this image", "run this skill in image 'vision'") from error
+    except subprocess.TimeoutExpired as error:
+        raise ctx.Fail(f"{what} took longer than {timeout_s:g} s", "make it shorter", retryable=True) from error
+    if done.returncode != 0:
+        words = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        raise ctx.Fail(f"{what} failed: {' / '.join(words[-3:])[:500] or f'ffmpeg ended with {done.returncode}'}")

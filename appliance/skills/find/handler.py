@@ -1,0 +1,49 @@
+"""find: look round for a coloured thing until it is seen, from where the robot is and from points about it."""
+
+from typing import Any
+
+from _lib import colours, looking, moves, params, paths, pictures
+from _lib.context import Context
+from _lib.places import Spot, resolve
+
+STEP_M = 1.5
+"""How far it goes for another view: turning alone is no command that every robot has, going somewhere is."""
+VIEWS = ((0.0, 1.0, "north"), (1.0, 0.0, "east"), (0.0, -1.0, "south"), (-1.0, 0.0, "west"))
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """Return found, detections, the picture it was seen in, the robot's pose and the number of views."""
+    target = params.text(ctx, "target")
+    if not colours.wanted(target, ctx.site).sure:
+        raise ctx.Fail(f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'")
+    speed = moves.speed(ctx)
+    if "area" in ctx.params:
+        moves.go(ctx, [resolve(ctx, params.text(ctx, "area"))], speed_mps=speed, share=0.2)
+    here = moves.state(ctx)
+    spots = [None, *(Spot(f"a view from the {side}", here.x + STEP_M * x, here.y + STEP_M * y) for x, y, side in VIEWS)]
+    views = 0
+    for number, spot in enumerate(spots):
+        if spot is not None:
+            if _closed(ctx, spot):
+                continue
+            moves.go(ctx, [spot], speed_mps=speed, done=0.2 + 0.15 * number, share=0.05)
+        data, about = pictures.take(ctx, target)
+        views += 1
+        picture = colours.decode(ctx, data, f"view {views}")
+        rows = colours.detections(picture, target, ctx.site)
+        ctx.progress(0.3 + 0.15 * number, f"view {views}: {len(rows)} seen")
+        if rows:
+            image = pictures.keep(ctx, target, data, views)
+            marked = ctx.put_artifact(
+                f"{params.slug(target)}-marked.png", colours.annotated(picture, rows), "image/png"
+            )
+            rows = [{**row, "image": image["artifact"]} for row in rows]
+            seen = {"found": True, "target": target, "detections": rows, "count": looking.most_in_one(rows)}
+            return {**seen, "image": image, "annotated": [marked], "views": views, "camera": about}
+    raise ctx.Fail(f"{target} was not seen from {views} points", "look in another area: name it as `area`")
+
+
+def _closed(ctx: Context, spot: Spot) -> bool:
+    """Whether a point cannot be stood at."""
+    boxes = (*(ctx.site.get("obstacles") or ()), *(ctx.site.get("forbidden") or ()))
+    return any(wall.grown(paths.CLEARANCE_M).holds((spot.x, spot.y)) for wall in paths.rectangles(boxes))
