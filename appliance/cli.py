@@ -161,7 +161,7 @@ def down(*, where: Where = HERE) -> int:
 def demo(
     *,
     ask: Annotated[
-        tuple[str, ...], Parameter(negative="", env_var="SWIFTBOT_ASK", help="A further instruction.")
+        tuple[str, ...], Parameter(negative="", help="A further instruction.")
     ] = (),
     tui: Annotated[bool, Parameter(negative="", help="Open the terminal UI on the running fleet.")] = False,
     keep: Annotated[bool, Parameter(negative="", help="Leave the fleet running.")] = False,
@@ -227,7 +227,8 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
         settings = msgspec.structs.replace(settings, directory=str(out))
 
     async def go() -> None:
-        await run_recorder(settings, PlaneConfig(mode="client", connect=connect), fleet, _until_signalled())
+        # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
+        await run_recorder(settings, PlaneConfig(mode="peer", connect=connect), fleet, _until_signalled())
 
     uvloop.run(go())
     return 0

@@ -1,0 +1,126 @@
+"""Write `docs/configuration.md` from the configuration structs, so that it cannot fall behind them.
+
+Each key's description is the string below its field in the source; its default is the struct's own.
+
+Usage: write_configuration.py [--check]
+"""
+
+import ast
+import importlib
+import inspect
+import sys
+from pathlib import Path
+
+import msgspec
+
+ROOT = Path(__file__).resolve().parent.parent
+TARGET = ROOT / "docs" / "configuration.md"
+SECTIONS = (
+    ("", "appliance.config", "GatewayConfig"),
+    ("plane", "appliance.plane.settings", "PlaneConfig"),
+    ("pool", "appliance.pool.settings", "PoolConfig"),
+    ("pool.weights", "appliance.pool.settings", "Weights"),
+    ("llm", "appliance.llm.settings", "LlmConfig"),
+    ("robots", "appliance.robots.settings", "RobotsConfig"),
+    ("robots.mavlink", "appliance.robots.settings", "MavlinkLink"),
+    ("record", "appliance.record.settings", "RecordConfig"),
+    ("tasks", "appliance.tasks.settings", "TasksConfig"),
+)
+HEAD = """# Configuration
+
+A gateway reads one TOML file: `swiftbot gateway --config /etc/swiftbot/gateway.toml`. The recorder reads the same
+file. It is read strictly: an unknown key or a wrong type ends the start with exit code 2 and names file and key.
+Only `id` must be given. This page is made from the sources by `scripts/write_configuration.py`; do not edit it.
+
+```toml
+id = "gw-1"
+fleet = "yard"
+site = "/etc/swiftbot/site.toml"
+
+[plane]
+listen = ["tcp/0.0.0.0:7447"]
+connect = ["tcp/gw-2.example:7447"]
+
+[pool]
+capacity = 8
+floor = {base = 2, vision = 1}
+
+[[robots.mavlink]]
+listen = "udp://0.0.0.0:14550"
+names = {"1" = "drone_1"}
+```
+
+Commands find their fleet by `--fleet` and `--dir` (a local fleet's state file) or by `--connect`; the environment
+variables `SWIFTBOT_FLEET`, `SWIFTBOT_DIR` and `SWIFTBOT_CONNECT` say the same.
+
+## Exit codes of `swiftbot`
+
+| code | meaning |
+| --- | --- |
+| 0 | done |
+| 1 | it failed: a task that did not succeed, a replay that differs, an internal error |
+| 2 | the command line or a configuration is wrong |
+| 3 | nobody answered (no gateway, robot or server) |
+| 4 | refused or not found: no valid plan, unknown robot, skill, task or place, a full gateway |
+| 5 | something the machine must have is missing (`swiftbot doctor` says what) |
+| 6 | no result in time |
+| 7 | cancelled |
+| 130 | interrupted |
+"""
+
+
+def fields(module: str, name: str) -> list[tuple[str, str, str, str]]:
+    """Key, type, default and description of each field of a struct, in source order."""
+    kind = getattr(importlib.import_module(module), name)
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name).body
+    known = {field.name: field for field in msgspec.structs.fields(kind)}
+    rows: list[tuple[str, str, str, str]] = []
+    for at, node in enumerate(body):
+        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+            continue
+        after = body[at + 1] if at + 1 < len(body) else None
+        text = ""
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            text = " ".join(str(after.value.value).split())
+        rows.append((node.target.id, ast.unparse(node.annotation), _default(known[node.target.id]), text))
+    return rows
+
+
+def _default(field: "msgspec.structs.FieldInfo") -> str:
+    if field.default is not msgspec.NODEFAULT:
+        value = field.default
+    elif field.default_factory is not msgspec.NODEFAULT:
+        value = field.default_factory()
+    else:
+        return "required"
+    return "a section of its own" if isinstance(value, msgspec.Struct) else msgspec.json.encode(value).decode()
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for section, module, name in SECTIONS:
+        kind = getattr(importlib.import_module(module), name)
+        title = f"`[{section}]`" if section else "Top level"
+        if section == "robots.mavlink":
+            title = "`[[robots.mavlink]]`"
+        parts.append(f"\n## {title}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n")
+        parts.append("| key | type | default | meaning |\n| --- | --- | --- | --- |")
+        for key, annotation, default, text in fields(module, name):
+            annotation = annotation.replace("|", "\\|")
+            parts.append(f"| `{key}` | `{annotation}` | `{default}` | {text.replace('|', chr(92) + '|')} |")
+    return "\n".join(parts) + "\n"
+
+
+def main() -> int:
+    """Write the page, or with --check say whether it is up to date."""
+    if "--check" in sys.argv:
+        return 0 if TARGET.read_text() == page() else 1
+    TARGET.write_text(page())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))
+    sys.exit(main())
