@@ -1,0 +1,72 @@
+# `make help` says what there is. Everything that needs setting up sets itself up first (scripts/setup.sh).
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.SILENT:
+.NOTPARALLEL:
+.PHONY: help setup demo test check lint types contracts unit format lock images install uninstall clean ready
+
+# Taken as it is, without make expanding "$", and given on in the environment: any text may stand in it.
+override ASK := $(value ASK)
+export ASK
+
+RUN := scripts/as_user.sh
+PYTEST := $(RUN) python -m pytest -p no:cacheprovider
+TUI_FLAG := $(if $(filter-out 0 no false,$(TUI)),--tui)
+
+help: ## This list
+	awk 'BEGIN { FS = ":.*## " } /^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	printf '\n  ASK="fetch the red box" make demo    adds an instruction (or: make demo ASK="…")\n  make demo TUI=1                      opens the terminal UI on the running fleet\n'
+
+setup: ## Everything a gateway needs on this machine (as root: service user; otherwise in .venv, with sudo)
+	scripts/setup.sh gateway
+
+demo: setup ## Start a fleet, run instructions on it, replay its log
+	$(RUN) swiftbot demo $${ASK:+"--ask=$$ASK"} $(TUI_FLAG)
+
+test: ## Set up and run everything: lint, types, import contracts, unit, integration and replay tests
+	scripts/setup.sh dev
+	$(MAKE) --no-print-directory lint types contracts READY=1
+	$(PYTEST) tests
+
+check: ready ## The fast part: lint, types, import contracts, unit tests
+	$(MAKE) --no-print-directory lint types contracts unit READY=1
+
+ready:
+	$(if $(READY),:,scripts/setup.sh dev --without-images)
+
+lint: ready ## Ruff: rules and format
+	$(RUN) ruff check --quiet .
+	$(RUN) ruff format --check --quiet . || { echo 'lint: not formatted (make format)' >&2; exit 1; }
+
+types: ready ## Basedpyright, strict
+	$(RUN) basedpyright --level error
+
+contracts: ready ## Import-linter: imports go downward only
+	$(RUN) lint-imports --no-cache
+
+unit: ready ## Unit tests
+	$(PYTEST) tests/unit
+
+format: ready ## Ruff: fix what it can and format, in this tree
+	. scripts/common.sh && "$$VENV/bin/ruff" check --fix --quiet . ; "$$VENV/bin/ruff" format .
+
+lock: ready ## Pin the dependencies anew in locks/ (UPGRADE=1: newest versions)
+	. scripts/common.sh && export UV_SYSTEM_CERTS=1 && compile() { \
+	  "$$TOOLS/bin/uv" pip compile --quiet --python /usr/bin/python3 --generate-hashes --no-emit-index-url --no-header --no-annotate $(if $(UPGRADE),--upgrade) "$$@"; }; \
+	compile pyproject.toml -o locks/gateway.txt && \
+	compile pyproject.toml --group dev -c locks/gateway.txt -o locks/dev.txt && \
+	compile locks/tools.in -o locks/tools.txt
+
+images: setup ## Build the container images (setup does so too)
+	$(RUN) swiftbot images build
+
+install: ## Install as systemd services on this machine (DESTDIR=… for a package)
+	DESTDIR="$(DESTDIR)" scripts/install.sh
+
+uninstall: ## Take the services out again (PURGE=1: data too)
+	DESTDIR="$(DESTDIR)" PURGE="$(PURGE)" scripts/uninstall.sh
+
+clean: ## Remove what builds and tests left in this tree
+	rm -rf dist .ruff_cache .hypothesis .import_linter_cache snapshot_report.html
+	find . -path ./.venv -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf
