@@ -1,0 +1,343 @@
+"""The terminal UI under Textual's pilot, 80 columns by 24 lines, on a fake view."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+
+import pytest
+from textual.pilot import Pilot
+from textual.widgets import Input
+
+from appliance.errors import PlanError, RefusedError, UnreachableError
+from appliance.model import GatewayStatus, Notice, TaskRecord, TaskState
+from appliance.tui.actions import ACTIONS
+from appliance.tui.app import SwiftbotApp, export_picture
+from appliance.tui.board import Connection
+from appliance.tui.dialogs import ConfirmDialog, HelpDialog, SubmitDialog
+from appliance.tui.panes import DiffTable
+
+if TYPE_CHECKING:
+    from .conftest import FakeView
+
+pytestmark = pytest.mark.anyio
+SIZE = (80, 24)
+
+
+def seen(app: SwiftbotApp) -> str:
+    """Return what is on the screen, line by line."""
+    lines = app.screen._compositor.render_strips()
+    return "\n".join("".join(segment.text for segment in strip) for strip in lines)
+
+
+async def settle(app: SwiftbotApp, pilot: Pilot[None]) -> str:
+    """Let everything happen and be drawn; return what is on the screen."""
+    await app.workers.wait_for_complete()
+    await pilot.pause()
+    app.draw(force=True)
+    await pilot.pause()
+    return seen(app)
+
+
+async def test_fleet_is_shown_at_80_by_24(view: "FakeView") -> None:
+    """The first screen has gateways with load and pool, robots, and what is wrong, in whole sentences."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        text = await settle(app, pilot)
+        for expected in ("gw-a", "42%", "3/4", "drone-1", "GUIDED armed", "81%", "1.0 2.0 10.0", "✘ offline"):
+            assert expected in text
+        assert "gw-b: podman.socket is absent" in text
+        assert "limits are not enforced" in text
+        assert "2 bad inputs refused (payload 2)" in text
+        assert "test · 2 gw · 2 robots · 1 active" in text
+    assert view.started
+    assert view.closed
+
+
+async def test_tasks_are_shown_with_the_plan_graph(view: "FakeView") -> None:
+    """The task screen draws the selected task's plan with state, place, phase, times, progress and failure."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=(80, 40)) as pilot:
+        await pilot.press("2")
+        text = await settle(app, pilot)
+        for expected in (
+            "t-running",
+            "✔ s1 takeoff",
+            "└─▶ ● s2 goto drone-1",
+            "50%",
+            "local warm · start 3.2 ms · took 1.5 s",
+            "gw-b · remote warm · start 9.5 ms · attempt 2 · leg 1 of 2",
+            "after s2, s3",
+            "coordinated by gw-a",
+            "the camera does not answer → switch rover-1 on",
+        ):
+            assert expected in text
+        await pilot.press("down")
+        assert "greet" in (await settle(app, pilot)).split("t-done")[-1]
+
+
+async def test_pool_is_shown(view: "FakeView") -> None:
+    """The pool screen has the containers of all gateways with what they run."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("3")
+        text = await settle(app, pilot)
+        for expected in ("c1", "base:1", "busy", "812.0 ms", "c2", "vision:1", "ready"):
+            assert expected in text
+
+
+async def test_log_grows_and_is_filtered(view: "FakeView") -> None:
+    """The log screen adds lines as they come, and shows only those with the filter's text."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("4")
+        view.board.take_notice(Notice(id="n1", to="ops", text="inspection done", at_ns=10**18))
+        assert "inspection done" in await settle(app, pilot)
+        view.board.take_notice(Notice(id="n2", to="ops", text="battery low", at_ns=10**18))
+        text = await settle(app, pilot)
+        assert text.count("inspection done") == 1
+        assert "battery low" in text
+        await pilot.press("slash", *"battery")
+        text = await settle(app, pilot)
+        assert "inspection done" not in text
+        assert "battery low" in text
+        await pilot.press("escape")
+        assert "inspection done" in await settle(app, pilot)
+
+
+async def test_rows_are_filtered_per_screen(view: "FakeView") -> None:
+    """A filter hides the rows without its text, on its own screen only; Enter keeps it, Escape ends it."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("2", "slash", *"greet", "enter")
+        await settle(app, pilot)
+        table = app.query_one("#tasks", DiffTable)
+        assert table.row_count == 1
+        assert app.query_one("#filter", Input).display
+        await pilot.press("3")
+        await settle(app, pilot)
+        assert app.query_one("#containers", DiffTable).row_count == 2
+        await pilot.press("2", "escape")
+        await settle(app, pilot)
+        assert table.row_count == 2
+
+
+async def test_submit_shows_the_plan_first(view: "FakeView") -> None:
+    """Enter plans and shows the plan; only a second Enter runs it, with that very plan, and the task is selected."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("s", *"look", "enter")
+        text = await settle(app, pilot)
+        assert view.planned == ["look"]
+        assert view.submitted == []
+        assert "inspection: 4 subtasks, 2 at once" in text
+        assert "└─▶ s2 goto drone-1" in text
+        await pilot.press("enter")
+        text = await settle(app, pilot)
+        assert [(instruction, plan.domain) for instruction, plan, _ in view.submitted] == [("look", "inspection")]
+        assert app.pane_name == "tasks"
+        assert app.query_one("#tasks", DiffTable).selected == view.submitted[0][2]
+
+
+async def test_editing_withdraws_the_plan(view: "FakeView") -> None:
+    """A plan that was shown is not run for an instruction edited since: it is planned anew."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("colon", *"a", "enter")
+        await settle(app, pilot)
+        await pilot.press("b", "enter")
+        await settle(app, pilot)
+        assert view.planned == ["a", "ab"]
+        assert view.submitted == []
+        await pilot.press("escape")
+        await pilot.pause()
+        assert not isinstance(app.screen, SubmitDialog)
+        assert view.submitted == []
+
+
+async def test_no_plan_is_explained(view: "FakeView") -> None:
+    """An instruction without a plan shows every problem and the remedy, and nothing runs."""
+    view.error = PlanError("no valid plan", remedy="name the robot", problems=("s1: no robot 'bob'",))
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("s", *"x", "enter")
+        text = await settle(app, pilot)
+        for expected in ("no valid plan", "s1: no robot 'bob'", "name the robot"):
+            assert expected in text
+        await pilot.press("enter")
+        await settle(app, pilot)
+        assert view.submitted == []
+
+
+async def test_submitting_again_is_the_same_task(view: "FakeView") -> None:
+    """After an answer that did not come, Enter submits again under the same task id."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("s", *"x", "enter")
+        await settle(app, pilot)
+        view.error = UnreachableError("no gateway answered", remedy="start one")
+        await pilot.press("enter")
+        assert "no gateway answered" in await settle(app, pilot)
+        view.error = None
+        await pilot.press("enter")
+        await settle(app, pilot)
+        assert len(view.submitted) == 2
+        assert view.submitted[0][2] == view.submitted[1][2]
+
+
+async def test_empty_instruction_is_refused(view: "FakeView") -> None:
+    """Enter on nothing asks for an instruction instead of a plan."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("s", "space", "enter")
+        assert "Write an instruction first" in await settle(app, pilot)
+        assert view.planned == []
+
+
+async def test_cancel_asks_first(view: "FakeView") -> None:
+    """`c` asks; n leaves the task alone, y cancels it."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("2")
+        await settle(app, pilot)
+        await pilot.press("c")
+        await pilot.pause()
+        assert isinstance(app.screen, ConfirmDialog)
+        assert "Cancel task t-running?" in seen(app)
+        await pilot.press("n")
+        await settle(app, pilot)
+        assert view.cancelled == []
+        await pilot.press("c", "y")
+        await settle(app, pilot)
+        assert view.cancelled == ["t-running"]
+
+
+async def test_cancel_of_an_ended_task_and_elsewhere(view: "FakeView") -> None:
+    """An ended task is not cancelled, and on other screens the key does nothing."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE, notifications=True) as pilot:
+        await pilot.press("c")
+        await pilot.pause()
+        assert not isinstance(app.screen, ConfirmDialog)
+        await pilot.press("2")
+        await settle(app, pilot)
+        await pilot.press("down", "c")
+        assert "has ended" in await settle(app, pilot)
+        assert not isinstance(app.screen, ConfirmDialog)
+
+
+async def test_refusal_is_shown_with_its_remedy(view: "FakeView") -> None:
+    """What a gateway refuses is shown with cause and remedy, and the UI goes on."""
+    view.error = RefusedError("gateway is draining", remedy="ask another")
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE, notifications=True) as pilot:
+        await pilot.press("2")
+        await settle(app, pilot)
+        await pilot.press("c", "enter")
+        text = await settle(app, pilot)
+        assert "gateway is draining" in text
+        assert "ask another" in text
+
+
+async def test_lost_connection_has_a_banner(view: "FakeView") -> None:
+    """Without a connection a banner names cause and remedy; it goes when the connection is back."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        assert "✘" not in (await settle(app, pilot)).split("\n")[1]
+        view.connection = Connection(
+            problem="no gateway of fleet test at tcp/x:1", remedy="start one with `swiftbot up`"
+        )
+        view.changes += 1
+        text = await settle(app, pilot)
+        assert "no gateway of fleet test at tcp/x:1 → start one" in text.replace("\n", " ")
+        view.connection = Connection(connected=True)
+        view.changes += 1
+        assert "no gateway of fleet" not in await settle(app, pilot)
+
+
+async def test_unchanged_rows_are_not_written(view: "FakeView") -> None:
+    """Only the cells that differ are written: one change of a gateway's load is one cell."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await settle(app, pilot)
+        table = app.query_one("#gateways", DiffTable)
+        before = table.cells_written
+        await settle(app, pilot)
+        assert table.cells_written == before
+        first, second = view.gateways
+        view.gateways = (
+            GatewayStatus(**{**{f: getattr(first, f) for f in first.__struct_fields__}, "load": 0.9}),
+            second,
+        )
+        assert "90%" in await settle(app, pilot)
+        assert table.cells_written == before + 1
+
+
+async def test_selection_stays_when_tasks_come(view: "FakeView") -> None:
+    """A new task comes to the top and the selection stays on the task it was on."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("2", "down")
+        await settle(app, pilot)
+        table = app.query_one("#tasks", DiffTable)
+        assert table.selected == "t-done"
+        view.board.take_task(TaskRecord(id="t-new", instruction="x", state=TaskState.ACCEPTED, created_ns=9))
+        await settle(app, pilot)
+        assert table.selected == "t-done"
+        assert table.row_count == 3
+
+
+async def test_help_lists_every_action(view: "FakeView") -> None:
+    """The help shows each action of the one list."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=(100, 40)) as pilot:
+        await pilot.press("question_mark")
+        await pilot.pause()
+        assert isinstance(app.screen, HelpDialog)
+        text = seen(app)
+        for action in ACTIONS:
+            assert action.help in text
+        await pilot.press("escape")
+        await pilot.pause()
+        assert not isinstance(app.screen, HelpDialog)
+
+
+async def test_palette_offers_every_action(view: "FakeView") -> None:
+    """The command palette is fed by the same list, and running an entry does the action."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        commands = {command.title: command for command in app.get_system_commands(app.screen)}
+        assert {action.title for action in ACTIONS} <= commands.keys()
+        await commands["Pool"].callback()
+        await pilot.pause()
+        assert app.pane_name == "pool"
+
+
+async def test_quit_leaves(view: "FakeView") -> None:
+    """`q` ends the UI and closes the view."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("q")
+        await pilot.pause()
+    assert view.closed
+    assert app.return_code == 0
+
+
+async def test_markup_in_foreign_text_is_text(view: "FakeView") -> None:
+    """Brackets in an instruction or a log line are shown as they are, not taken for markup."""
+    view.board.take_task(TaskRecord(id="t-x", instruction="[red]go[/] [/bad]", created_ns=9))
+    view.board.add(10**18, kind="log", level="info", source="[b]", text="[/nope] done")
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("2")
+        assert "[red]go[/] [/bad]" in await settle(app, pilot)
+        await pilot.press("4")
+        assert "[/nope] done" in await settle(app, pilot)
+
+
+async def test_picture_is_an_svg_of_the_screen(view: "FakeView", tmp_path: Path) -> None:
+    """The picture is well-formed SVG with the screen's text and no reference to another machine's fonts."""
+    await export_picture(view, tmp_path / "tui.svg")
+    text = (tmp_path / "tui.svg").read_text()
+    ET.fromstring(text)  # noqa: S314 - our own file
+    assert "t-running" in text
+    assert "font-face" not in text
