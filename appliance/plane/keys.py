@@ -15,7 +15,9 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
 def check_name(name: str, what: str) -> str:
     """Return `name` if it may be one chunk of a key; PayloadError otherwise."""
     if not _NAME.fullmatch(name):
-        raise PayloadError(f"{what} {name[:80]!r} is not a valid name", remedy="use a-z, 0-9, '_', '.', '-'; at most 63")
+        raise PayloadError(
+            f"{what} {name[:80]!r} is not a valid name", remedy="use a-z, 0-9, '_', '.', '-'; at most 63"
+        )
     return name
 
 

@@ -1,0 +1,126 @@
+"""Requests from one gateway to another: a verb is a queryable `gw/{gateway}/rpc/{verb}`, JSON in and out.
+
+Queries cannot be subscribed to, so the answering gateway puts a record of each exchange where the recorder and
+any Zenoh client can see it; what would be too large there is named by its digest.
+"""
+
+import hashlib
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import Raw, Struct
+
+from appliance.errors import ConfigError, PayloadError, SwiftbotError
+from appliance.model import ErrorReply, encode
+from appliance.plane.session import Closer, Session
+
+Q = TypeVar("Q", bound=Struct)
+R = TypeVar("R", bound=Struct)
+
+_EXCHANGE_BYTES = 32 * 1024
+"""A request or reply larger than this appears in its exchange record by size and digest only."""
+
+
+class Exchange(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What was asked of a gateway and what it answered; published after the answer."""
+
+    verb: str
+    gateway: str
+    request: Raw
+    duration_ms: float
+    reply: Raw | None = None
+    error: ErrorReply | None = None
+
+
+class Digest(Struct, frozen=True):
+    """In place of a payload that is too large to repeat."""
+
+    bytes: int
+    sha256: str
+
+
+class Rpc:
+    """Serves one gateway's verbs and calls those of others; a client (`gateway` None) only calls."""
+
+    def __init__(self, session: Session, gateway: str | None) -> None:
+        self._session = session
+        self._gateway = gateway
+        self._verbs: dict[str, Callable[[bytes], Awaitable[bytes]]] = {}
+        self._closers: list[Closer] = []
+
+    def register(
+        self, verb: str, request: type[Q], handler: Callable[[Q], Awaitable[Struct]], *, exchange: bool = True
+    ) -> None:
+        """Answer a verb. `exchange=False` is for the plane's own traffic, which would only repeat what is put anyway."""
+        gateway = self._gateway
+        if gateway is None or verb in self._verbs:
+            raise ConfigError(f"the verb {verb} cannot be served here")
+        decoder = msgspec.json.Decoder(request)
+
+        async def answer(payload: bytes) -> bytes:
+            try:
+                asked = decoder.decode(payload)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                raise PayloadError(
+                    f"{verb}: not a {request.__name__}: {error}", remedy="docs/keyspace.md has the requests"
+                ) from error
+            return encode(await handler(asked))
+
+        async def serve(payload: bytes) -> bytes:
+            if not exchange:
+                return await answer(payload)
+            began = time.monotonic()
+            reply: bytes | None = None
+            failure: ErrorReply | None = None
+            try:
+                reply = await answer(payload)
+                return reply
+            except SwiftbotError as error:
+                failure = ErrorReply(code=error.code, message=error.message, remedy=error.remedy)
+                raise
+            except Exception as error:
+                failure = ErrorReply(code="internal", message=f"{type(error).__name__}: {error}")
+                raise
+            finally:
+                record = Exchange(
+                    verb=verb,
+                    gateway=gateway,
+                    request=_shown(payload, checked=failure is None),
+                    reply=None if reply is None else _shown(reply, checked=True),
+                    error=failure,
+                    duration_ms=round((time.monotonic() - began) * 1e3, 3),
+                )
+                self._session.put(self._session.keys.exchange(gateway, verb), encode(record))
+
+        self._verbs[verb] = serve
+        key = self._session.keys.rpc(gateway, verb)
+        self._closers.append(self._session.serve(key, lambda _, payload: serve(payload)))
+
+    async def call(self, gateway: str, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0) -> R:
+        """Ask a gateway; errors are those of `Session.query`, and PayloadError when the answer is no `reply`."""
+        key = self._session.keys.rpc(gateway, verb)
+        answer = await self._session.query(key, encode(request), timeout_s=timeout_s)
+        try:
+            return msgspec.json.decode(answer, type=reply)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            self._session.refuse(f"malformed answer {verb}", key=key, reason=str(error))
+            raise PayloadError(f"{gateway} answered {verb} with no {reply.__name__}: {error}") from error
+
+    def close(self) -> None:
+        """Answer no more."""
+        for closer in self._closers:
+            closer.close()
+
+
+def _shown(payload: bytes, *, checked: bool) -> Raw:
+    """The payload as JSON to embed: itself, its digest when too large, or its text when it is not JSON."""
+    if len(payload) > _EXCHANGE_BYTES:
+        return Raw(encode(Digest(bytes=len(payload), sha256=hashlib.sha256(payload).hexdigest())))
+    if not checked:
+        try:
+            msgspec.json.decode(payload, type=Any)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return Raw(encode(payload.decode(errors="replace")))
+    return Raw(payload)

@@ -1,0 +1,468 @@
+"""The one thin wrapper around a Zenoh session: nothing else in the product touches the library.
+
+It exists to keep three promises. Every callback runs on the event loop's thread. Every payload that arrives is
+bounded, and one that is malformed or oversize is counted, logged and dropped or answered with an ErrorReply.
+Nothing that is sent can hang the loop: sends block when a peer is stuck (dropping would lose facts silently), but
+they do so on a thread of their own, and a peer stuck for a lease is disconnected.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import msgspec
+import structlog
+import zenoh
+from msgspec import Struct
+from zenoh.handlers import Callback
+
+from appliance.errors import (
+    ConfigError,
+    DeadlineError,
+    PayloadError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+    from_code,
+)
+from appliance.model import ErrorReply, encode
+from appliance.plane.keys import Keys
+from appliance.plane.queues import Inbox, Outbox
+from appliance.plane.settings import PlaneConfig
+
+log = structlog.get_logger(__name__)
+
+T = TypeVar("T")
+
+_CLOSE_S = 2.0
+"""How long a closing session keeps sending what waits."""
+_WIRE_HEADROOM = 8
+"""Zenoh itself drops messages of more than so many times the largest payload, before they are whole in memory."""
+
+
+class Message(Struct, frozen=True):
+    """A put or delete as it arrived. `at_ns` is the sender's hybrid logical clock, Unix nanoseconds."""
+
+    key: str
+    payload: bytes
+    deleted: bool
+    at_ns: int
+    encoding: str
+
+
+class Closer:
+    """Ends a subscription, service or token; more than once does no harm."""
+
+    def __init__(self, end: Callable[[], None]) -> None:
+        self._end: Callable[[], None] | None = end
+
+    def close(self) -> None:
+        """End it."""
+        end, self._end = self._end, None
+        if end is not None:
+            # An entity of a closed session is gone already.
+            with contextlib.suppress(zenoh.ZError):
+                end()
+
+
+class Session:
+    """A Zenoh session of one fleet; made by `open`, ended by `close`."""
+
+    def __init__(self, config: PlaneConfig, fleet: str, raw: zenoh.Session, loop: asyncio.AbstractEventLoop) -> None:
+        self.config = config
+        self.keys = Keys(fleet)
+        self.refused: dict[str, int] = {}
+        self._raw = raw
+        self._loop = loop
+        self._inbox = Inbox(loop, messages=config.queue_messages, payload_bytes=config.queue_bytes)
+        self._outbox = Outbox(messages=config.queue_messages, payload_bytes=config.queue_bytes)
+        self._answering: set[asyncio.Task[None]] = set()
+        self._closed = False
+
+    @classmethod
+    async def open(cls, config: PlaneConfig, fleet: str) -> "Session":
+        """Open a session as configured. Peers start in any order and keep looking for each other for ever.
+
+        Raises:
+            ConfigError: a setting is wrong, or an endpoint to listen on is in use or not of this machine.
+            UnreachableError: a client found no endpoint that answers.
+        """
+        config.check()
+        Keys(fleet)
+        try:
+            raw = await asyncio.to_thread(zenoh.open, _zenoh_config(config))
+        except zenoh.ZError as error:
+            raise _open_error(config, str(error)) from error
+        return cls(config, fleet, raw, asyncio.get_running_loop())
+
+    @property
+    def linked(self) -> int:
+        """Sessions linked to directly just now, however they came about."""
+        return len(list(self._raw.info.peers_zid())) + len(list(self._raw.info.routers_zid()))
+
+    # --- facts ------------------------------------------------------------------------------------------------
+
+    def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:
+        """Publish; returns at once. What cannot be sent (too large, queue full) is counted and logged."""
+        if len(payload) > self.config.max_payload_bytes:
+            self.refuse("oversize put", key=key, size=len(payload))
+            return
+        send = partial(
+            self._raw.put,
+            key,
+            payload,
+            encoding=encoding,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+        )
+        self._send(key, send, len(payload))
+
+    def delete(self, key: str) -> None:
+        """Publish that a key's fact is gone."""
+        self._send(key, partial(self._raw.delete, key, congestion_control=zenoh.CongestionControl.BLOCK), 0)
+
+    def _send(self, key: str, send: Callable[[], None], size: int) -> None:
+        if not self._outbox.send(partial(_quietly, send, key), size) and not self._closed:
+            self.refuse("outgoing queue full", key=key)
+
+    def subscribe(self, expr: str, callback: Callable[[Message], None]) -> Closer:
+        """Have every put and delete under `expr` delivered, as bytes; oversize ones are counted and dropped."""
+        name, limit = self._name(expr), self.config.max_payload_bytes
+
+        def take(sample: zenoh.Sample) -> None:
+            key, size = str(sample.key_expr), len(sample.payload)
+            if size > limit:
+                self._inbox.post(partial(self.refuse, f"oversize {name}", key=key, size=size))
+                return
+            stamp = sample.timestamp
+            message = Message(
+                key,
+                sample.payload.to_bytes(),
+                sample.kind == zenoh.SampleKind.DELETE,
+                stamp.get_time_as_ntp64().as_nanos() if stamp else time.time_ns(),
+                str(sample.encoding),
+            )
+            self._inbox.post(partial(callback, message), size)
+
+        subscriber = self._raw.declare_subscriber(expr, Callback(take, indirect=False))
+        return Closer(subscriber.undeclare)
+
+    def subscribe_typed(self, expr: str, kind: type[T], callback: Callable[[str, T | None], None]) -> Closer:
+        """Have facts delivered decoded, None when one is deleted; malformed ones are counted, logged, dropped."""
+        decoder, name = msgspec.json.Decoder(kind), self._name(expr)
+
+        def take(message: Message) -> None:
+            if message.deleted:
+                callback(message.key, None)
+                return
+            try:
+                value = decoder.decode(message.payload)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                self.refuse(f"malformed {name}", key=message.key, reason=str(error))
+                return
+            callback(message.key, value)
+
+        return self.subscribe(expr, take)
+
+    # --- questions --------------------------------------------------------------------------------------------
+
+    def serve(self, expr: str, handler: Callable[[str, bytes], Awaitable[bytes]]) -> Closer:
+        """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
+
+        A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
+        and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
+        """
+        limit, running, name = self.config.max_payload_bytes, set[asyncio.Task[None]](), self._name(expr)
+
+        def take(query: zenoh.Query) -> None:
+            key, payload = str(query.key_expr), query.payload
+            size = len(payload) if payload is not None else 0
+            if size > limit:
+                error = PayloadError(f"{key}: {size:,} bytes", remedy=f"at most {limit:,}")
+                begin = partial(self._refuse_query, f"oversize {name}", query, expr, error)
+                size = 0
+            else:
+                data = payload.to_bytes() if payload is not None else b""
+                begin = partial(answer, key, data, query)
+            if not self._inbox.post(begin, size):
+                _reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
+
+        def answer(key: str, data: bytes, query: zenoh.Query) -> None:
+            if len(running) >= self.config.concurrent_queries:
+                error = RefusedError(f"{key}: {len(running)} queries are being answered", remedy="try again later")
+                self._refuse_query(f"too many {name}", query, expr, error)
+                return
+            task = self._loop.create_task(self._answer(handler, key, data, query, expr))
+            for group in (running, self._answering):
+                group.add(task)
+                task.add_done_callback(group.discard)
+
+        queryable = self._raw.declare_queryable(expr, Callback(take, indirect=False), complete=True)
+        return Closer(queryable.undeclare)
+
+    async def _answer(
+        self, handler: Callable[[str, bytes], Awaitable[bytes]], key: str, data: bytes, query: zenoh.Query, expr: str
+    ) -> None:
+        reply: bytes | None = None
+        error: SwiftbotError | None = None
+        try:
+            reply = await handler(key, data)
+            if len(reply) > self.config.max_payload_bytes:
+                error = PayloadError(f"{key}: the answer has {len(reply):,} bytes", remedy="ask for less at once")
+        except SwiftbotError as refusal:
+            if isinstance(refusal, PayloadError):
+                self.refuse(f"malformed {self._name(expr)}", key=key, reason=str(refusal))
+            error = refusal
+        except asyncio.CancelledError:
+            error = UnreachableError("whoever was asked is stopping", remedy="ask another gateway")
+            raise
+        except Exception as defect:  # the supervision boundary of `serve`
+            log.exception("a query's handler failed", key=key)
+            error = SwiftbotError(f"{type(defect).__name__}: {defect}")
+        finally:
+            size = len(reply) if reply is not None and error is None else 0
+            if self._closed:
+                _reply(query, expr, reply, error)
+            else:
+                self._send(key, partial(_reply, query, expr, reply, error), size)
+
+    def _refuse_query(self, what: str, query: zenoh.Query, expr: str, error: SwiftbotError) -> None:
+        self.refuse(what, key=str(query.key_expr), reason=str(error))
+        self._send(expr, partial(_reply, query, expr, None, error), 0)
+
+    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        """Ask whoever serves a key and return the first answer.
+
+        Raises:
+            UnreachableError: nobody serves the key, or whoever did went away before answering.
+            DeadlineError: no answer within `timeout_s` seconds.
+            PayloadError: the request or the answer is too large.
+            SwiftbotError: what the answering side raised.
+        """
+        answer: asyncio.Future[bytes] = self._loop.create_future()
+
+        def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
+            if not answer.done():
+                if error is not None:
+                    answer.set_exception(error)
+                elif data is not None:
+                    answer.set_result(data)
+
+        def on_end() -> None:
+            if not answer.done():
+                answer.set_exception(
+                    UnreachableError(f"nobody answers on {key}", remedy="is that gateway or robot up and linked?")
+                )
+
+        self._get(key, payload, timeout_s, on_reply, on_end, target=zenoh.QueryTarget.BEST_MATCHING)
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await answer
+        except TimeoutError:
+            raise DeadlineError(f"no answer on {key} within {timeout_s:g} s") from None
+        finally:
+            answer.cancel()
+
+    async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
+        """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out."""
+        messages: list[Message] = []
+        ended = asyncio.Event()
+
+        def on_reply(key: str, data: bytes | None, error: SwiftbotError | None) -> None:
+            if data is not None:
+                messages.append(Message(key, data, deleted=False, at_ns=time.time_ns(), encoding="application/json"))
+            elif error is not None:
+                log.debug("an answer is an error", expr=expr, error=str(error))
+
+        self._get(expr, payload, timeout_s, on_reply, ended.set, target=zenoh.QueryTarget.ALL)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return list(messages)
+
+    def _get(
+        self,
+        expr: str,
+        payload: bytes,
+        timeout_s: float,
+        on_reply: Callable[[str, bytes | None, SwiftbotError | None], None],
+        on_end: Callable[[], None],
+        *,
+        target: zenoh.QueryTarget,
+    ) -> None:
+        limit = self.config.max_payload_bytes
+        if len(payload) > limit:
+            raise PayloadError(f"a request of {len(payload):,} bytes on {expr}", remedy=f"at most {limit:,}")
+        if self._closed:
+            raise UnreachableError("the session is closed")
+
+        def take(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is None:
+                error = _error_of(reply.err)
+                self._inbox.post(partial(on_reply, expr, None, error), must=True)
+            elif (size := len(sample.payload)) > limit:
+                self._inbox.post(partial(self.refuse, "oversize answer", key=expr, size=size))
+                error = PayloadError(f"the answer on {expr} has {size:,} bytes", remedy=f"at most {limit:,}")
+                self._inbox.post(partial(on_reply, expr, None, error), must=True)
+            else:
+                data = sample.payload.to_bytes()
+                self._inbox.post(partial(on_reply, str(sample.key_expr), data, None), size, must=True)
+
+        send = partial(
+            self._raw.get,
+            expr,
+            Callback(take, drop=lambda: self._inbox.post(on_end, must=True) and None, indirect=False),
+            target=target,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
+            timeout=timeout_s + 1.0,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+            payload=payload,
+        )
+        self._send(expr, cast("Callable[[], None]", send), len(payload))
+
+    # --- presence ---------------------------------------------------------------------------------------------
+
+    def declare_alive(self, key: str) -> Closer:
+        """Show a liveliness token until closed, or until this process dies."""
+        token = self._raw.liveliness().declare_token(key)
+        return Closer(token.undeclare)
+
+    def watch_alive(self, expr: str, callback: Callable[[str, bool], None]) -> Closer:
+        """Have the coming (True) and going (False) of tokens delivered, those already there first."""
+
+        def take(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            self._inbox.post(partial(callback, str(sample.key_expr), alive), must=True)
+
+        subscriber = self._raw.liveliness().declare_subscriber(expr, Callback(take, indirect=False), history=True)
+        return Closer(subscriber.undeclare)
+
+    # --- bad input, end ---------------------------------------------------------------------------------------
+
+    def refuse(self, what: str, **fields: Any) -> None:
+        """Count bad input; logged the first ten times and then at powers of two, so a flood does not fill the log."""
+        count = self.refused.get(what, 0) + 1
+        self.refused[what] = count
+        if count <= 10 or count & (count - 1) == 0:
+            fields = {key: value[:300] if isinstance(value, str) else value for key, value in fields.items()}
+            log.warning("refused", what=what, count=count, **fields)
+
+    def _name(self, expr: str) -> str:
+        return expr.removeprefix(f"{self.keys.root}/")
+
+    async def close(self) -> None:
+        """End every query under way with an error, send what waits, close. Needed: Zenoh hangs the exit without."""
+        if self._closed:
+            return
+        for task in tuple(self._answering):
+            task.cancel()
+        if self._answering:
+            await asyncio.wait(self._answering, timeout=_CLOSE_S)
+        self._closed = True
+        await asyncio.to_thread(self._outbox.close, _CLOSE_S)
+        await asyncio.to_thread(self._raw.close)
+        self._inbox.close()
+
+
+def _reply(query: zenoh.Query, expr: str, reply: bytes | None, error: SwiftbotError | None) -> None:
+    """Answer and end a query; the asking side may be gone, which is no concern of ours."""
+    key = str(query.key_expr) if "*" in expr else expr
+    with contextlib.suppress(zenoh.ZError), query:
+        if error is not None or reply is None:
+            error = error or SwiftbotError("no answer")
+            problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
+            body = ErrorReply(code=error.code, message=error.message, remedy=error.remedy, problems=problems)
+            query.reply_err(encode(body), encoding="application/json")
+        else:
+            query.reply(key, reply, encoding="application/json", express=True)
+
+
+def _quietly(send: Callable[[], None], key: str) -> None:
+    try:
+        send()
+    except zenoh.ZError as error:
+        log.warning("not sent", key=key, reason=str(error))
+
+
+def _error_of(error: zenoh.ReplyError | None) -> SwiftbotError:
+    text = error.payload.to_bytes()[:65_536] if error is not None else b""
+    if text == b"Timeout":  # Zenoh's own way of saying so
+        return DeadlineError("no answer in time")
+    try:
+        body = msgspec.json.decode(text, type=ErrorReply)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return SwiftbotError(f"answered with an error that cannot be read: {text[:200]!r}")
+    rebuilt = from_code(body.code, body.message, body.remedy)
+    if body.problems and hasattr(rebuilt, "problems"):
+        rebuilt.problems = body.problems  # pyright: ignore[reportAttributeAccessIssue]
+    return rebuilt
+
+
+def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
+    """Zenoh's own configuration; design/platform has the measurements behind it."""
+    client = config.mode == "client"
+    settings: dict[str, Any] = {
+        "mode": config.mode,
+        "listen/endpoints": list(config.listen),
+        "listen/exit_on_failure": True,
+        "listen/timeout_ms": 0,
+        "connect/endpoints": list(config.connect),
+        # Peers look for each other for ever in the background, so gateways may start in any order.
+        "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
+        "connect/exit_on_failure": client,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "scouting/delay": 0,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": config.lease_ms,
+        "transport/link/tx/keep_alive": 4,
+        # A peer that takes nothing for a lease is as good as dead: its link is closed and the sender goes on.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": config.lease_ms * 1000,
+        "transport/link/rx/max_message_size": config.max_payload_bytes * _WIRE_HEADROOM,
+        "transport/unicast/open_timeout": 3000,
+        "transport/unicast/accept_timeout": 3000,
+    }
+    made = zenoh.Config()
+    for key, value in settings.items():
+        made.insert_json5(key, msgspec.json.encode(value).decode())
+    return made
+
+
+def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
+    for endpoint in config.listen:
+        if f"bound to {endpoint}" in text or endpoint in text:
+            if "in use" in text:
+                return ConfigError(
+                    f"cannot listen on {endpoint}: the port is in use",
+                    remedy="another gateway may be running; stop it (`swiftbot down`) or change plane.listen",
+                )
+            if "assign requested address" in text:
+                return ConfigError(
+                    f"cannot listen on {endpoint}: this machine has no such address",
+                    remedy="set plane.listen to an address of this machine, or 0.0.0.0",
+                )
+            if "ermission denied" in text:
+                return ConfigError(f"cannot listen on {endpoint}: not permitted", remedy="use a port above 1023")
+            return ConfigError(f"cannot listen on {endpoint}: {_first(text)}", remedy="correct plane.listen")
+    if config.mode == "client":
+        return UnreachableError(
+            f"nothing answers at {', '.join(config.connect)}",
+            remedy="is the fleet up? try `swiftbot up` or `--connect`",
+        )
+    return ConfigError(
+        f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect"
+    )
+
+
+def _first(text: str) -> str:
+    """The message without the library's source locations."""
+    return text.partition(" at /")[0].replace(str(Path.home()), "~")

@@ -1,0 +1,106 @@
+"""What an operator may set about the plane, each default with its reason."""
+
+from typing import Literal
+from urllib.parse import urlsplit
+
+from msgspec import Struct
+
+from appliance.errors import ConfigError
+
+_PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "serial"})
+
+
+class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Zenoh session, ring and store of one process."""
+
+    mode: Literal["peer", "client", "router"] = "peer"
+    """`peer`: a few gateways, full mesh by gossip. `client`: everybody else, and large fleets behind routers."""
+    listen: tuple[str, ...] = ()
+    """Endpoints to accept links on, such as `tcp/0.0.0.0:7447`; empty: accept none."""
+    connect: tuple[str, ...] = ()
+    """Endpoints to keep linked to. Name every gateway you know: gossip finds the others, but a single cut link is
+    redialled only where it is named."""
+    replicas: int = 3
+    """Copies of a record, the owner's among them: two gateways may die at once without losing one (design: r = 3)."""
+    virtual_nodes: int = 32
+    """Points of each gateway on the ring: shares within about 20 % of each other, and still cheap to compute."""
+    find_successors: int = 5
+    """How many successors of hash(image) are asked for containers (paper: k = 5)."""
+    lease_ms: int = 1000
+    """A link silent for so long is dead. 1 s: a frozen gateway is noticed in about 0.75 s; Zenoh's own is 10 s."""
+    max_payload_bytes: int = 8 * 2**20
+    """Larger messages are refused, in and out: a picture fits, a mistake does not exhaust the memory."""
+    max_record_bytes: int = 4 * 2**20
+    """Largest value of a record; it must still fit into a payload after base64 (4/3) beside its version."""
+    connect_timeout_s: float = 3.0
+    """How long a client looks for its first endpoint before it says that none answers. Peers never stop looking."""
+    join_wait_s: float = 0.5
+    """How long a starting gateway waits for its first link before it concludes that it is the first one up."""
+    replica_timeout_s: float = 0.3
+    """How long an owner waits for a slow replica; what it misses is repaired by anti-entropy."""
+    write_timeout_s: float = 5.0
+    """How long a write looks for a reachable owner: well over detection (1 s) and takeover."""
+    anti_entropy_s: float = 10.0
+    """Interval of comparing digests with the other replicas while nothing changes; a comparison costs one hash."""
+    tombstone_hours: float = 24.0
+    """How long a removal is remembered. A gateway away for longer may bring a removed record back."""
+    coalesce_ms: int = 20
+    """Facts changed within this time are published together: a burst of container changes is one message each."""
+    queue_messages: int = 20_000
+    """Bound of each queue between Zenoh and the event loop; beyond it messages are dropped and counted."""
+    queue_bytes: int = 128 * 2**20
+    """The same in bytes."""
+    concurrent_queries: int = 256
+    """Queries answered at once per served key; more are refused with the reason."""
+
+    def check(self) -> None:
+        """Raise ConfigError when a setting cannot work."""
+        for name, endpoints in (("listen", self.listen), ("connect", self.connect)):
+            for endpoint in endpoints:
+                protocol, slash, address = endpoint.partition("/")
+                if not slash or protocol not in _PROTOCOLS or not address:
+                    raise ConfigError(
+                        f"plane.{name}: {endpoint!r} is not an endpoint", remedy="write it like tcp/192.168.1.10:7447"
+                    )
+                if protocol in ("tcp", "udp", "tls", "quic", "ws"):
+                    _check_port(name, endpoint, address)
+        if self.mode == "client" and not self.connect:
+            raise ConfigError("plane.connect is empty", remedy="a client needs an endpoint of a gateway or router")
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"plane.{name} is {getattr(self, name)}", remedy=f"at least {least}")
+        if self.max_record_bytes * 4 // 3 + 65_536 > self.max_payload_bytes:
+            raise ConfigError(
+                f"plane.max_record_bytes {self.max_record_bytes:,} does not fit into plane.max_payload_bytes "
+                f"{self.max_payload_bytes:,} once encoded",
+                remedy="keep it under 0.7 of max_payload_bytes",
+            )
+
+
+_LEAST: dict[str, float] = {
+    "replicas": 1,
+    "virtual_nodes": 1,
+    "find_successors": 1,
+    "lease_ms": 100,
+    "max_payload_bytes": 131_072,
+    "max_record_bytes": 1024,
+    "connect_timeout_s": 0,
+    "join_wait_s": 0,
+    "replica_timeout_s": 0.01,
+    "write_timeout_s": 0.1,
+    "anti_entropy_s": 0.1,
+    "tombstone_hours": 0.01,
+    "coalesce_ms": 0,
+    "queue_messages": 100,
+    "queue_bytes": 2**20,
+    "concurrent_queries": 1,
+}
+
+
+def _check_port(name: str, endpoint: str, address: str) -> None:
+    try:
+        port = urlsplit(f"//{address}").port
+    except ValueError:
+        port = None
+    if port is None:
+        raise ConfigError(f"plane.{name}: {endpoint!r} has no valid port", remedy="write it like tcp/192.168.1.10:7447")
