@@ -11,7 +11,7 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import uvloop
@@ -28,7 +28,9 @@ FLEET = Group("A fleet on this machine", sort_key=1)
 WORK = Group("Work", sort_key=2)
 TOOLS = Group("Logs, images, checks", sort_key=4)
 
-app = App(name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0")
+app = App(
+    name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
+)
 task_app = App(name="task", help="List, show and cancel tasks.", group=WORK)
 log_app = App(name="log", help="Look into MCAP logs and replay them.", group=TOOLS)
 sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
@@ -160,24 +162,20 @@ def down(*, where: Where = HERE) -> int:
 @app.command(group=FLEET)
 def demo(
     *,
-    ask: Annotated[
-        tuple[str, ...], Parameter(negative="", help="A further instruction.")
-    ] = (),
+    ask: Annotated[tuple[str, ...], Parameter(negative="", help="A further instruction.")] = (),
     tui: Annotated[bool, Parameter(negative="", help="Open the terminal UI on the running fleet.")] = False,
     keep: Annotated[bool, Parameter(negative="", help="Leave the fleet running.")] = False,
     gateways: int = 3,
     robots: str = "mavlink=1,zenoh=1",
     site: str = "warehouse",
     rate: float = 4.0,
-    where: Where = Where(fleet="demo"),  # noqa: B008 - frozen
+    where: Where = Where(fleet="demo"),
 ) -> int:
     """Run the main job once through: a fleet, instructions, plans, results, the log and its replay."""
     from appliance import demo as demonstration
 
     asks = [each for each in ask if each.strip()]
-    good = asyncio.run(
-        demonstration.run(_order(where, gateways, robots, site, rate), asks=asks, tui=tui, keep=keep)
-    )
+    good = asyncio.run(demonstration.run(_order(where, gateways, robots, site, rate), asks=asks, tui=tui, keep=keep))
     return 0 if good else 1
 
 
@@ -242,9 +240,7 @@ def _until_signalled() -> asyncio.Event:
 
 
 @sim_app.command
-def mavlink(
-    *, to: str, system: int = 1, site: str = "warehouse", rate: float = 1.0, start: str = "home"
-) -> int:
+def mavlink(*, to: str, system: int = 1, site: str = "warehouse", rate: float = 1.0, start: str = "home") -> int:
     """Simulate a MAVLink copter that sends to a gateway's UDP port.
 
     Args:
@@ -314,7 +310,9 @@ def plan(text: str, *, as_json: Json = False, where: Where = HERE) -> int:
 def submit(
     text: str,
     *,
-    wait: Annotated[bool, Parameter(negative="", help="Show progress and wait for the end; Ctrl-C cancels it.")] = False,
+    wait: Annotated[
+        bool, Parameter(negative="", help="Show progress and wait for the end; Ctrl-C cancels it.")
+    ] = False,
     task_id: Annotated[str, Parameter(name="--id", help="Task id; a known one is not done twice.")] = "",
     as_json: Json = False,
     where: Where = HERE,
@@ -332,8 +330,8 @@ def submit(
                 if not as_json:
                     return await follow(client, accepted.id)
                 last = accepted
-                async for last in client.watch(accepted.id):
-                    pass
+                async for record in client.watch(accepted.id):
+                    last = record
             except asyncio.CancelledError:
                 console.err.print(f"cancelling task {accepted.id}")
                 await asyncio.shield(client.cancel(accepted.id))
@@ -447,10 +445,11 @@ def robots(*, as_json: Json = False, where: Where = HERE) -> int:
 @app.command(group=WORK)
 def tui(*, where: Where = HERE) -> int:
     """Open the terminal UI on a fleet."""
+    from appliance.plane.settings import PlaneConfig
     from appliance.tui.app import run_tui
 
     endpoint = where.endpoint()
-    asyncio.run(run_tui(endpoint.connect, fleet=endpoint.fleet))
+    asyncio.run(run_tui(PlaneConfig(mode="client", connect=endpoint.connect), endpoint.fleet))
     return 0
 
 

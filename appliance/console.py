@@ -10,6 +10,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from appliance.doctor import Check
 from appliance.model import (
     ContainerInfo,
     GatewayStatus,
@@ -20,7 +21,6 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
-from appliance.doctor import Check
 from appliance.pool.images import ImageState
 from appliance.record.facts import LogInfo
 from appliance.tasks.replay import ReplayReport
@@ -157,7 +157,9 @@ def progress_line(record: SubtaskRecord) -> str:
     where = f" on {record.gateway}" if record.gateway else ""
     share = f" {record.progress:.0%}" if record.state is SubtaskState.RUNNING and record.progress else ""
     told = brief(record)
-    return f"  {record.subtask.id:>4} {record.subtask.skill:<14} {record.state}{where}{share}{'  ' + told if told else ''}"
+    return (
+        f"  {record.subtask.id:>4} {record.subtask.skill:<14} {record.state}{where}{share}{'  ' + told if told else ''}"
+    )
 
 
 def task_list(records: Sequence[TaskRecord]) -> Table:
@@ -206,7 +208,13 @@ def container_table(containers: Sequence[ContainerInfo]) -> Table:
         table.add_column(name, overflow="fold")
     for each in containers:
         table.add_row(
-            each.gateway, each.id[:12], each.image, str(each.state), str(each.runs), milliseconds(each.cold_ms), each.run
+            each.gateway,
+            each.id[:12],
+            each.image,
+            str(each.state),
+            str(each.runs),
+            milliseconds(each.cold_ms),
+            each.run,
         )
     return table
 
@@ -252,7 +260,8 @@ def log_summary(found: LogInfo) -> Group:
     for each in sorted(found.channels, key=lambda channel: -channel.messages):
         table.add_row(each.key, f"{each.messages:,}", each.encoding, each.schema or "–")
     head = Text(
-        f"{found.path}: {found.messages:,} messages in {found.duration_s:.1f} s, {found.size_bytes:,} bytes", style="bold"
+        f"{found.path}: {found.messages:,} messages in {found.duration_s:.1f} s, {found.size_bytes:,} bytes",
+        style="bold",
     )
     notes = [Text(f"! {problem}", style="yellow") for problem in found.problems]
     if found.recovered:

@@ -17,6 +17,7 @@ from appliance.client import FleetClient
 from appliance.errors import SwiftbotError
 from appliance.local_fleet import FleetState, Order
 from appliance.model import SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.plane.settings import PlaneConfig
 from appliance.tasks.replay import ReplayReport, replay
 
 INSTRUCTIONS = (
@@ -44,14 +45,16 @@ async def run(order: Order, *, asks: Sequence[str], tui: bool = False, keep: boo
     good = True
     try:
         async with FleetClient(state.endpoint) as client:
-            console.out.print(console.gateway_table(sorted(client.plane.registry.gateways.values(), key=lambda g: g.id)))
+            console.out.print(
+                console.gateway_table(sorted(client.plane.registry.gateways.values(), key=lambda g: g.id))
+            )
             for ask in (*INSTRUCTIONS, *asks):
                 record = await _one(client, ask)
                 good = good and record.state is TaskState.SUCCEEDED
         if tui:
             from appliance.tui.app import run_tui  # noqa: PLC0415 - Textual is only wanted here
 
-            await run_tui(state.endpoint.connect, fleet=state.fleet)
+            await run_tui(PlaneConfig(mode="client", connect=state.endpoints), state.fleet)
     finally:
         if keep:
             _say(f"the fleet goes on: `swiftbot --help`; end it with `swiftbot down --dir {order.directory}`")
@@ -61,9 +64,7 @@ async def run(order: Order, *, asks: Sequence[str], tui: bool = False, keep: boo
     reports = _replay(state, log_files)
     good = good and bool(reports) and all(report.same for report in reports)
     verdict = "all succeeded, and the replayed log ends in the same states" if good else "NOT all of it went well"
-    console.out.print(
-        Text(f"{verdict} ({time.monotonic() - began:.1f} s)", style="bold green" if good else "bold red")
-    )
+    console.out.print(Text(f"{verdict} ({time.monotonic() - began:.1f} s)", style="bold green" if good else "bold red"))
     return good
 
 

@@ -13,7 +13,7 @@
     ├── PoolError            a container could not be started, reached or kept
     ├── RobotError           a robot did not do what was asked
     ├── RecordError          a log cannot be written or read
-    └── CancelledByOperator  somebody asked for it to stop
+    └── CancelledByOperatorError  somebody asked for it to stop
 
 `code` travels over Zenoh in an error reply and is turned back into the same class on the other side.
 `exit_code` is what the command line ends with (docs/configuration.md lists them).
@@ -122,7 +122,7 @@ class RecordError(SwiftbotError):
     code = "record"
 
 
-class CancelledByOperator(SwiftbotError):
+class CancelledByOperatorError(SwiftbotError):
     """Somebody asked for it to stop."""
 
     code = "cancelled"

@@ -65,9 +65,7 @@ class Gateway:
         config = self.config
         catalogue, site = self._load()
         self._make_directories()
-        self.plane = await Plane.open(
-            config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data
-        )
+        self.plane = await Plane.open(config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data)
         self._stack.push_async_callback(self.plane.close)
         logs.publish_to(self._put_log)
         self._stack.callback(logs.publish_to, None)
@@ -77,7 +75,11 @@ class Gateway:
         self._stack.push_async_callback(self.decomposer.close)
 
         self.hub = RobotHub(
-            config.robots, session=self.plane.session, store=self.plane.store, gateway=config.id, site=site,
+            config.robots,
+            session=self.plane.session,
+            store=self.plane.store,
+            gateway=config.id,
+            site=site,
             on_task=self._on_robot_task,
         )
         await self.hub.start()
@@ -142,7 +144,8 @@ class Gateway:
                 directory.mkdir(parents=True, exist_ok=True, mode=0o700)
             except OSError as error:
                 raise ConfigError(
-                    f"{directory} cannot be made: {error.strerror}", remedy="set data_dir and run_dir to writable places"
+                    f"{directory} cannot be made: {error.strerror}",
+                    remedy="set data_dir and run_dir to writable places",
                 ) from error
 
     def _run_dir(self) -> Path:

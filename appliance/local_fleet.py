@@ -168,14 +168,32 @@ class _Starting:
         self._spawn("recorder", "record", "--config", str(directory / names[0] / "gateway.toml"))
         for number, drone in enumerate(drones):
             self._spawn(
-                drone, "sim", "mavlink", "--to", f"udp://127.0.0.1:{udp_ports[number]}",
-                "--system", str(number + 1), "--site", order.site, "--rate", str(order.sim_rate),
+                drone,
+                "sim",
+                "mavlink",
+                "--to",
+                f"udp://127.0.0.1:{udp_ports[number]}",
+                "--system",
+                str(number + 1),
+                "--site",
+                order.site,
+                "--rate",
+                str(order.sim_rate),
             )
         for rover in rovers:
             self._spawn(
-                rover, "sim", "zenoh", "--name", rover, "--fleet", order.fleet,
+                rover,
+                "sim",
+                "zenoh",
+                "--name",
+                rover,
+                "--fleet",
+                order.fleet,
                 *(each for endpoint in endpoints for each in ("--connect", endpoint)),
-                "--site", order.site, "--rate", str(order.sim_rate),
+                "--site",
+                order.site,
+                "--rate",
+                str(order.sim_rate),
             )
         state = FleetState(
             fleet=order.fleet,
@@ -226,9 +244,7 @@ class _Starting:
                 ],
                 setsid=True,
             )
-        self.processes.append(
-            Process(name=name, pid=pid, started=psutil.Process(pid).create_time(), log=str(path))
-        )
+        self.processes.append(Process(name=name, pid=pid, started=psutil.Process(pid).create_time(), log=str(path)))
 
 
 async def _wait_ready(state: FleetState, order: Order, progress: Progress, timeout_s: float) -> None:

@@ -123,9 +123,7 @@ class Calls:
         async def ask(member: str, piece: ArtifactAsk) -> ArtifactPiece:
             return await self._plane.rpc.call(member, "artifact", piece, ArtifactPiece)
 
-        data = await self._artifacts.get(
-            cast("dict[str, Any]", reference), ask=ask, members=self._plane.members()
-        )
+        data = await self._artifacts.get(cast("dict[str, Any]", reference), ask=ask, members=self._plane.members())
         return {"data": data}
 
 

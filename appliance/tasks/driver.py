@@ -95,7 +95,7 @@ class Wake(Struct, frozen=True):
 Input = RunNews | GatewayLost | CancelAsked | Wake
 
 
-class Superseded(SwiftbotError):
+class SupersededError(SwiftbotError):
     """Another gateway coordinates the task now."""
 
     code = "superseded"
@@ -150,7 +150,7 @@ class Driver:
                 while not self._inbox.empty():
                     await self._handle(self._inbox.get_nowait())
             await self._flush()
-        except Superseded as error:
+        except SupersededError as error:
             log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
         finally:
             for order in self._orders:
@@ -403,9 +403,7 @@ class Driver:
         elif status.last is None:
             sent = self._sent_at.get(target.subtask.id, 0.0)
             if time.monotonic() - sent > self._around.config.run_timeout_s:
-                failure = Failure(
-                    code="unreachable", message=f"{target.gateway} does not know the run", retryable=True
-                )
+                failure = Failure(code="unreachable", message=f"{target.gateway} does not know the run", retryable=True)
                 self._attempt_failed(target, failure, None)
 
     async def _ask(self, target: SubtaskRecord, verb: str) -> RunStatus | None:
@@ -439,7 +437,7 @@ class Driver:
                 self._ready_ns[each.subtask.id] = time.monotonic_ns()
 
     async def _flush(self) -> None:
-        """Write the record, then publish what led to it and send the orders that follow; Superseded if it moved on.
+        """Write the record, then publish what led to it and send the orders that follow; SupersededError if it moved on.
 
         One write covers all transitions since the last: a finished subtask and the dispatch of its successors
         become durable together, which takes a replicated write off the successors' start.
@@ -475,7 +473,7 @@ class Driver:
         holder = ""
         if current is not None:
             holder = msgspec.json.decode(current.value, type=TaskRecord).coordinator
-        raise Superseded(f"the record has moved on to {holder or 'nobody'}")
+        raise SupersededError(f"the record has moved on to {holder or 'nobody'}")
 
 
 def task_key(task: str) -> str:
@@ -485,9 +483,7 @@ def task_key(task: str) -> str:
 
 def need_of(manifest: SkillManifest) -> Need:
     """What a skill asks of a container."""
-    return Need(
-        image=manifest.image, cpu=manifest.cpu, memory_mb=manifest.memory_mb, volumes=manifest.volumes
-    )
+    return Need(image=manifest.image, cpu=manifest.cpu, memory_mb=manifest.memory_mb, volumes=manifest.volumes)
 
 
 def deadline_s(manifest: SkillManifest, params: dict[str, Any]) -> float:

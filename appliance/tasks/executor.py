@@ -135,10 +135,14 @@ class Executor:
         try:
             final = await self._pool.run(request, decision, tell)
         except SwiftbotError as error:
-            final = _failed(request, Failure(code=error.code, message=error.message, remedy=error.remedy, retryable=True))
-        except Exception as error:  # noqa: BLE001 - supervision boundary: a run must end with an event, whatever broke
+            final = _failed(
+                request, Failure(code=error.code, message=error.message, remedy=error.remedy, retryable=True)
+            )
+        except Exception as error:
             log.exception("run broke", run=run_id)
-            final = _failed(request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True))
+            final = _failed(
+                request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
+            )
         final = replace(final, gateway=self._plane.gateway, phase=phase)
         self._remember(run_id, final)
         await begun

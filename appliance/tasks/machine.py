@@ -77,7 +77,7 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Of a failed attempt: no further one will be made."""
 
 
-class StaleTransition(SwiftbotError):
+class StaleTransitionError(SwiftbotError):
     """The transition does not fit the record: an outdated attempt, a repeated event, a final task."""
 
     code = "stale"
@@ -94,11 +94,11 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
         The record after it.
 
     Raises:
-        StaleTransition: it does not fit; the record stands as it was.
+        StaleTransitionError: it does not fit; the record stands as it was.
     """
     if record is None:
         if event.kind is not TransitionKind.ACCEPTED or event.sequence != 1:
-            raise StaleTransition(f"{event.kind} (sequence {event.sequence}) before the task was accepted")
+            raise StaleTransitionError(f"{event.kind} (sequence {event.sequence}) before the task was accepted")
         return TaskRecord(
             id=event.task,
             instruction=event.instruction,
@@ -110,14 +110,14 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
             sequence=1,
         )
     if event.task != record.id:
-        raise StaleTransition(f"transition of task {event.task} applied to {record.id}")
+        raise StaleTransitionError(f"transition of task {event.task} applied to {record.id}")
     if event.sequence != record.sequence + 1:
-        raise StaleTransition(f"sequence {event.sequence} after {record.sequence}")
+        raise StaleTransitionError(f"sequence {event.sequence} after {record.sequence}")
     if record.state.final:
-        raise StaleTransition(f"task {record.id} has already {record.state}")
+        raise StaleTransitionError(f"task {record.id} has already {record.state}")
     handler = _HANDLERS.get(event.kind)
     if handler is None:
-        raise StaleTransition(f"{event.kind} of a task that was accepted before")
+        raise StaleTransitionError(f"{event.kind} of a task that was accepted before")
     changed = _settle(handler(record, event))
     return replace(changed, sequence=event.sequence, updated_ns=event.at_ns, coordinator=event.coordinator)
 
@@ -126,14 +126,14 @@ def fits(record: TaskRecord, event: Transition) -> bool:
     """Whether `apply` would take the transition."""
     try:
         apply(record, event)
-    except StaleTransition:
+    except StaleTransitionError:
         return False
     return True
 
 
 def _planned(record: TaskRecord, event: Transition) -> TaskRecord:
     if record.state is not TaskState.ACCEPTED or event.plan is None:
-        raise StaleTransition(f"a plan for task {record.id}, which is {record.state}")
+        raise StaleTransitionError(f"a plan for task {record.id}, which is {record.state}")
     subtasks = tuple(
         SubtaskRecord(subtask=subtask, state=SubtaskState.WAITING if subtask.after else SubtaskState.READY)
         for subtask in event.plan.subtasks
@@ -143,7 +143,7 @@ def _planned(record: TaskRecord, event: Transition) -> TaskRecord:
 
 def _plan_failed(record: TaskRecord, event: Transition) -> TaskRecord:
     if record.state not in (TaskState.ACCEPTED, TaskState.CANCELLING):
-        raise StaleTransition(f"no plan for task {record.id}, which is {record.state}")
+        raise StaleTransitionError(f"no plan for task {record.id}, which is {record.state}")
     return replace(record, state=TaskState.FAILED, failure=event.failure)
 
 
@@ -154,9 +154,9 @@ def _adopted(record: TaskRecord, event: Transition) -> TaskRecord:  # noqa: ARG0
 def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
     if record.state is not TaskState.RUNNING or target.state is not SubtaskState.READY:
-        raise StaleTransition(f"dispatch of {event.subtask}, which is {target.state}")
+        raise StaleTransitionError(f"dispatch of {event.subtask}, which is {target.state}")
     if event.attempt != target.attempt + 1:
-        raise StaleTransition(f"attempt {event.attempt} of {event.subtask} after {target.attempt}")
+        raise StaleTransitionError(f"attempt {event.attempt} of {event.subtask} after {target.attempt}")
     return _with(
         record,
         replace(
@@ -197,7 +197,7 @@ def _started(record: TaskRecord, event: Transition) -> TaskRecord:
 def _progress(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
     if target.state.final or event.attempt != target.attempt:
-        raise StaleTransition(f"progress of attempt {event.attempt} of {event.subtask}, which is {target.state}")
+        raise StaleTransitionError(f"progress of attempt {event.attempt} of {event.subtask}, which is {target.state}")
     return _with(record, replace(target, progress=event.progress, note=event.note))
 
 
@@ -221,7 +221,7 @@ def _succeeded(record: TaskRecord, event: Transition) -> TaskRecord:
 def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
     if event.failure is None:
-        raise StaleTransition("a failed attempt without a reason")
+        raise StaleTransitionError("a failed attempt without a reason")
     if target.state is SubtaskState.READY and event.attempt == target.attempt + 1 and event.give_up:
         # Given up before it could be sent anywhere: nobody can run it.
         attempts = target.attempts
@@ -240,7 +240,7 @@ def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
 
 def _cancel(record: TaskRecord, event: Transition) -> TaskRecord:
     if record.state is TaskState.CANCELLING:
-        raise StaleTransition(f"task {record.id} is being cancelled already")
+        raise StaleTransitionError(f"task {record.id} is being cancelled already")
     return _stop_rest(replace(record, state=TaskState.CANCELLING, failure=None))
 
 
@@ -278,13 +278,13 @@ def _subtask(record: TaskRecord, event: Transition) -> SubtaskRecord:
     try:
         return record.of(event.subtask)
     except KeyError:
-        raise StaleTransition(f"task {record.id} has no subtask {event.subtask!r}") from None
+        raise StaleTransitionError(f"task {record.id} has no subtask {event.subtask!r}") from None
 
 
 def _current(record: TaskRecord, event: Transition, *states: SubtaskState) -> SubtaskRecord:
     target = _subtask(record, event)
     if target.state not in states or event.attempt != target.attempt:
-        raise StaleTransition(
+        raise StaleTransitionError(
             f"{event.kind} of attempt {event.attempt} of {event.subtask}, which is {target.state} at {target.attempt}"
         )
     return target

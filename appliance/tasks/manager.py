@@ -261,9 +261,7 @@ class TaskManager:
         """Return the plan handed in with the task if it is valid, else a new one."""
         robots = tuple(self.plane.registry.robots.values())
         if record.plan is not None:
-            problems = validate(
-                record.plan, self._catalogue, robots=robots, site=self._site, require_implemented=True
-            )
+            problems = validate(record.plan, self._catalogue, robots=robots, site=self._site, require_implemented=True)
             if problems:
                 raise PlanError("the plan handed in is not valid", problems=problems)
             return record.plan
@@ -273,9 +271,7 @@ class TaskManager:
         """Decompose an instruction against the present roster and site; run nothing."""
         instruction = self._checked(TaskRequest(instruction=ask.instruction)).instruction
         robots = tuple(sorted(self.plane.registry.robots.values(), key=lambda robot: robot.id))
-        outcome = await self._decomposer.plan(
-            PlanContext(instruction=instruction, robots=robots, site=self._site)
-        )
+        outcome = await self._decomposer.plan(PlanContext(instruction=instruction, robots=robots, site=self._site))
         return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts)
 
     def manifest(self, skill: str) -> SkillManifest:
@@ -308,9 +304,7 @@ class TaskManager:
         return place(
             need_of(self.manifest(target.subtask.skill)),
             here=self.plane.gateway,
-            gateways={
-                name: status for name, status in registry.gateways.items() if name in self.plane.members()
-            },
+            gateways={name: status for name, status in registry.gateways.items() if name in self.plane.members()},
             containers=registry.containers,
             holds=_holds(record, target),
             robot=registry.robots.get(robot) if robot else None,
@@ -322,9 +316,7 @@ class TaskManager:
         """Send a run order; to this gateway it is a call."""
         if gateway == self.plane.gateway:
             return await self._executor.run(request)
-        return await self.plane.rpc.call(
-            gateway, "run", request, RunAccepted, timeout_s=self.config.run_timeout_s
-        )
+        return await self.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=self.config.run_timeout_s)
 
     # --- questions --------------------------------------------------------------------------------------------
 

@@ -67,9 +67,7 @@ def place(
     scored.sort(key=lambda row: (row[2] in avoid, -row[0], not row[1], row[2]))
     if not scored:
         return Placement(order=(), why="; ".join(reasons) or "no gateway is present")
-    return Placement(
-        order=tuple(row[2] for row in scored), why=", ".join([row[3] for row in scored] + reasons)
-    )
+    return Placement(order=tuple(row[2] for row in scored), why=", ".join([row[3] for row in scored] + reasons))
 
 
 def _warm(need: Need, containers: Iterable[ContainerInfo]) -> float:

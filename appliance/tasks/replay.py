@@ -15,7 +15,7 @@ from appliance.errors import RecordError
 from appliance.model import SubtaskRecord, TaskRecord
 from appliance.record.reader import read
 from appliance.tasks import machine
-from appliance.tasks.machine import StaleTransition, Transition, TransitionKind
+from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind
 
 
 class TaskReplay(Struct, frozen=True, kw_only=True):
@@ -65,7 +65,7 @@ class _Folding:
             base = self.history.get(event.sequence - 1, base)
         try:
             self.record = machine.apply(base, event)
-        except StaleTransition as error:
+        except StaleTransitionError as error:
             self.stale += 1
             if base is None or event.sequence > base.sequence + 1:
                 self.gaps.append(f"gap before transition {event.sequence} ({event.kind}): {error.message}")

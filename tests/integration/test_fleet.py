@@ -91,7 +91,9 @@ async def test_an_instruction_becomes_results_in_warm_containers_and_replays(fle
     """A sequential and a parallel instruction succeed on warm containers, and the log replays to the same ends."""
     async with FleetClient(fleet.endpoint) as client:
         look = await client.submit(
-            TaskRequest(instruction="Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator")
+            TaskRequest(
+                instruction="Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator"
+            )
         )
         first = await wait_for(client, look.id)
         assert first.state is TaskState.SUCCEEDED, first.failure
@@ -203,8 +205,20 @@ async def test_garbage_on_every_key_is_refused_and_counted(fleet: FleetState) ->
                 keys.notice("operator"),
             ):
                 session.put(key, payload)
-            for verb in ("submit", "accept", "plan", "task", "tasks", "cancel", "run", "run_status", "run_cancel",
-                         "artifact", "find_containers", "no_such_verb"):
+            for verb in (
+                "submit",
+                "accept",
+                "plan",
+                "task",
+                "tasks",
+                "cancel",
+                "run",
+                "run_status",
+                "run_cancel",
+                "artifact",
+                "find_containers",
+                "no_such_verb",
+            ):
                 replies = await asyncio.to_thread(_ask_raw, fleet, keys.rpc("gw-1", verb), payload)
                 assert not any(replies), f"{verb} took {payload[:20]!r}"
         await asyncio.sleep(3.0)
@@ -228,7 +242,7 @@ def _ask_raw(fleet: FleetState, key: str, payload: bytes) -> list[bool]:
 
 
 async def test_the_command_line_tells_what_is_asked(fleet: FleetState) -> None:
-    """submit --json has every promised field; nonsense, unknown robots and unknown tasks end with exit 4 and a reason."""
+    """Submit --json has every promised field; nonsense, unknown robots and unknown tasks end with exit 4 and a reason."""
     done = await asyncio.to_thread(cli, fleet, "submit", "Rover_1: go to dock 1", "--wait", "--json")
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)

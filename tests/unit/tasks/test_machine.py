@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from appliance.model import Failure, Phase, Plan, Subtask, SubtaskState, TaskRecord, TaskState
 from appliance.tasks import machine
-from appliance.tasks.machine import StaleTransition, Transition, TransitionKind, apply
+from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind, apply
 
 PLAN = Plan(
     domain="perception",
@@ -56,7 +56,7 @@ def test_all_succeeded_ends_the_task() -> None:
         record = dispatched(record, subtask)
         record = step(record, TransitionKind.SUCCEEDED, subtask=subtask, attempt=1)
     assert record.state is TaskState.SUCCEEDED
-    with pytest.raises(StaleTransition, match="already succeeded"):
+    with pytest.raises(StaleTransitionError, match="already succeeded"):
         step(record, TransitionKind.CANCEL)
 
 
@@ -67,7 +67,7 @@ def test_result_of_an_outdated_attempt_is_stale() -> None:
     record = step(record, TransitionKind.ATTEMPT_FAILED, subtask="s1", attempt=1, failure=lost)
     assert record.of("s1").state is SubtaskState.READY
     record = dispatched(record, "s1", attempt=2)
-    with pytest.raises(StaleTransition):
+    with pytest.raises(StaleTransitionError):
         step(record, TransitionKind.SUCCEEDED, subtask="s1", attempt=1, result={"late": True})
     record = step(record, TransitionKind.SUCCEEDED, subtask="s1", attempt=2)
     assert [attempt.number for attempt in record.of("s1").attempts] == [1, 2]
@@ -164,7 +164,7 @@ def test_any_sequence_of_events_keeps_the_record_sound(
                 plan=PLAN,
                 failure=Failure(code="x", message="x", retryable=retryable),
             )
-        except StaleTransition:
+        except StaleTransitionError:
             assert record is before
             continue
         for each in record.subtasks:

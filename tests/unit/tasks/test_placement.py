@@ -20,7 +20,9 @@ def container(gateway: str, state: ContainerState = ContainerState.READY, image:
     return ContainerInfo(id=f"{gateway}-c", gateway=gateway, image=image, state=state)
 
 
-def order(gateways: list[GatewayStatus], *, warm: tuple[str, ...] = (), here: str = "gw-1", **fields: object) -> tuple[str, ...]:
+def order(
+    gateways: list[GatewayStatus], *, warm: tuple[str, ...] = (), here: str = "gw-1", **fields: object
+) -> tuple[str, ...]:
     """Place a subtask and return the order."""
     arguments: dict[str, object] = {"holds": {}, "robot": None, "avoid": frozenset(), **fields}
     return place(
@@ -102,7 +104,9 @@ def test_any_is_a_robot_that_can_do_all_that_its_label_must() -> None:
 def test_any_prefers_a_robot_that_is_free() -> None:
     """Of two that can, the idle one."""
     these = records(Subtask(id="s1", skill="goto", robot="any"))
-    found = bind("any", these, robots=ROBOTS, uses={"s1": ("base",)}, verbs={"s1": ("goto",)}, busy=frozenset({"drone_1"}))
+    found = bind(
+        "any", these, robots=ROBOTS, uses={"s1": ("base",)}, verbs={"s1": ("goto",)}, busy=frozenset({"drone_1"})
+    )
     assert found == ("rover_1", "")
 
 

@@ -13,7 +13,9 @@ from appliance.tasks import machine
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.replay import replay
 
-PLAN = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock 1"}),))
+PLAN = Plan(
+    domain="navigation", subtasks=(Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock 1"}),)
+)
 
 
 def history(*steps: tuple[TransitionKind, dict[str, object]]) -> tuple[list[Transition], TaskRecord]:
@@ -82,7 +84,14 @@ def test_a_takeover_goes_on_from_the_last_written_record(tmp_path: Path) -> None
     """Progress the dead coordinator published but did not write is rewound, as the new one did."""
     transitions, written = history(*STEPS[:4])
     told = Transition(
-        task="t-1", sequence=5, kind=TransitionKind.PROGRESS, at_ns=5, coordinator="gw-1", subtask="s1", attempt=1, progress=0.5
+        task="t-1",
+        sequence=5,
+        kind=TransitionKind.PROGRESS,
+        at_ns=5,
+        coordinator="gw-1",
+        subtask="s1",
+        attempt=1,
+        progress=0.5,
     )
     adopted = Transition(task="t-1", sequence=5, kind=TransitionKind.ADOPTED, at_ns=6, coordinator="gw-2")
     after = machine.apply(written, adopted)
