@@ -88,7 +88,7 @@ class Gateway:
         artifacts = Artifacts(
             self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
         )
-        calls = Calls(self.plane, artifacts, on_wait=lambda call, note: self.executor.waits(call, note))
+        calls = Calls(self.plane, artifacts, on_wait=self._on_wait)
         remote = RemoteContainers(self.plane, successors=config.plane.find_successors)
 
         async def on_call(call: Call) -> dict[str, object]:
@@ -174,6 +174,9 @@ class Gateway:
 
     def _put_log(self, line: LogLine) -> None:
         self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
+
+    def _on_wait(self, call: Call, note: str) -> None:
+        self.executor.waits(call, note)
 
     def _on_robot_task(self, robot: str, request: TaskRequest) -> None:
         """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""

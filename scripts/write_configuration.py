@@ -108,8 +108,8 @@ def page() -> str:
         parts.append(f"\n## {title}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n")
         parts.append("| key | type | default | meaning |\n| --- | --- | --- | --- |")
         for key, annotation, default, text in fields(module, name):
-            annotation = annotation.replace("|", "\\|")
-            parts.append(f"| `{key}` | `{annotation}` | `{default}` | {text.replace('|', chr(92) + '|')} |")
+            shown = annotation.replace("|", "\\|")
+            parts.append(f"| `{key}` | `{shown}` | `{default}` | {text.replace('|', chr(92) + '|')} |")
     return "\n".join(parts) + "\n"
 
 

@@ -147,7 +147,7 @@ def _plan_failed(record: TaskRecord, event: Transition) -> TaskRecord:
     return replace(record, state=TaskState.FAILED, failure=event.failure)
 
 
-def _adopted(record: TaskRecord, event: Transition) -> TaskRecord:  # noqa: ARG001 - the coordinator is set for all
+def _adopted(record: TaskRecord, _: Transition) -> TaskRecord:
     return record
 
 

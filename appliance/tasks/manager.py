@@ -230,7 +230,7 @@ class TaskManager:
             try:
                 record = msgspec.json.decode(stored.value, type=TaskRecord)
             except msgspec.DecodeError as error:
-                log.error("task record cannot be read", key=stored.key, reason=str(error))
+                log.warning("task record cannot be read", key=stored.key, reason=str(error))
                 continue
             if record.state.final:
                 finished.append((record.updated_ns, stored.key, stored.version))

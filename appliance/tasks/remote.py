@@ -1,4 +1,4 @@
-"""Phase 2 of container selection: who else has a ready container? (paper, Algorithm 1, distributed search)
+"""Phase 2 of container selection, finding a ready container elsewhere (paper, Algorithm 1, distributed search).
 
 The k successors of hash(image) are asked; each answers with the ready containers it knows of, its own and those
 it has heard of. The cost of using one is the measured round trip to its gateway, kept as a moving average.

@@ -26,6 +26,7 @@ from appliance.tasks.replay import replay
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 
+LOOK = "Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator"
 FETCH = "Rover_1: go to dock 3, pick the red box, then go to dock 2 and place it at dock 2"
 
 
@@ -49,8 +50,8 @@ async def wait_for(client: FleetClient, task: str) -> TaskRecord:
     """Wait for a task's end."""
     record = None
     async with asyncio.timeout(90):
-        async for record in client.watch(task):
-            pass
+        async for changed in client.watch(task):
+            record = changed
     assert record is not None
     return record
 
@@ -90,11 +91,7 @@ def cli(state: FleetState, *arguments: str) -> "subprocess.CompletedProcess[str]
 async def test_an_instruction_becomes_results_in_warm_containers_and_replays(fleet: FleetState) -> None:
     """A sequential and a parallel instruction succeed on warm containers, and the log replays to the same ends."""
     async with FleetClient(fleet.endpoint) as client:
-        look = await client.submit(
-            TaskRequest(
-                instruction="Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator"
-            )
-        )
+        look = await client.submit(TaskRequest(instruction=LOOK))
         first = await wait_for(client, look.id)
         assert first.state is TaskState.SUCCEEDED, first.failure
         both = await client.submit(
@@ -242,7 +239,7 @@ def _ask_raw(fleet: FleetState, key: str, payload: bytes) -> list[bool]:
 
 
 async def test_the_command_line_tells_what_is_asked(fleet: FleetState) -> None:
-    """Submit --json has every promised field; nonsense, unknown robots and unknown tasks end with exit 4 and a reason."""
+    """Submit --json has every promised field; nonsense, strange robots and tasks end with exit 4 and a reason."""
     done = await asyncio.to_thread(cli, fleet, "submit", "Rover_1: go to dock 1", "--wait", "--json")
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
