@@ -190,7 +190,7 @@ def _manifests(root: Path) -> Iterator[SkillManifest]:
                 f"{folder}: skill.toml is missing", remedy="write it as docs/skills.md shows, or remove the folder"
             )
         table = _read(file, {"implemented", "folder"})
-        manifest = _convert(file, table, SkillManifest)
+        manifest = convert(file, table, SkillManifest, rows=("params", Param))
         _check_name(file, "id", manifest.id, folder)
         if manifest.domain not in DOMAINS:
             raise _wrong(file, "domain", f"{manifest.domain!r} is none of {', '.join(DOMAINS)}")
@@ -208,7 +208,7 @@ def _images(root: Path) -> Iterator[ImageSpec]:
         file = folder / "image.toml"
         if not file.is_file():
             raise ConfigError(f"{folder}: image.toml is missing", remedy="write it as docs/skills.md shows")
-        spec = _convert(file, _read(file, {"folder"}), ImageSpec)
+        spec = convert(file, _read(file, {"folder"}), ImageSpec)
         _check_name(file, "name", spec.name, folder)
         if not spec.packages:
             raise _wrong(file, "packages", "an image needs at least python3")
@@ -234,23 +234,33 @@ def _read(file: Path, reserved: set[str]) -> dict[str, Any]:
     return table
 
 
-def _convert(file: Path, table: dict[str, Any], kind: type[_Kind]) -> _Kind:
+def convert(
+    file: Path, table: dict[str, Any], kind: type[_Kind], *, rows: tuple[str, type[Struct]] | None = None
+) -> _Kind:
+    """Turn a table of a file into a struct; ConfigError with file and key where it does not fit.
+
+    `rows` is the key that holds tables by name, and their struct: msgspec tells no names there.
+    """
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        raise validation_error(file, error) from error
+        if rows is not None and isinstance(table.get(rows[0]), dict):
+            for name, row in table[rows[0]].items():
+                try:
+                    msgspec.convert(row, rows[1])
+                except msgspec.ValidationError as inner:
+                    raise _validation(file, inner, f"{rows[0]}.{name}") from inner
+        raise _validation(file, error) from error
 
 
-def validation_error(file: Path, error: msgspec.ValidationError) -> ConfigError:
+def _validation(file: Path, error: msgspec.ValidationError, at: str = "") -> ConfigError:
     """Turn msgspec's complaint (``… - at `$.params.x` ``) into one that names the file and the key."""
-    text = str(error)
-    what, _, at = text.partition(" - at ")
-    key = at.strip("`").removeprefix("$").lstrip(".")
+    what, _, where = str(error).partition(" - at ")
     named = re.search(r"(?:unknown|required) field `([^`]+)`", what)
+    parts = [at, where.strip("`").removeprefix("$").lstrip("."), named.group(1) if named else ""]
     if named:
-        key = f"{key}.{named.group(1)}" if key else named.group(1)
         what = "unknown key" if "unknown" in what else "missing"
-    return _wrong(file, key or "(whole file)", what)
+    return _wrong(file, ".".join(part for part in parts if part) or "(whole file)", what)
 
 
 def _check_name(file: Path, key: str, name: str, folder: Path) -> None:

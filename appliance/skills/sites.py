@@ -14,7 +14,7 @@ import msgspec
 
 from appliance.errors import ConfigError
 from appliance.model import Box, Place, Site, SiteObject
-from appliance.skills.catalogue import SKILLS, validation_error
+from appliance.skills.catalogue import SKILLS, convert
 
 SITES = SKILLS / "sites"
 """The sites that come with the product."""
@@ -40,10 +40,7 @@ def load_site(where: str | Path) -> Site:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read: {error}", remedy="mend the TOML there") from error
     _check_keys(file, table)
-    try:
-        site = msgspec.convert(table, Site)
-    except msgspec.ValidationError as error:
-        raise validation_error(file, error) from error
+    site = convert(file, table, Site, rows=("places", Place))
     _check_places(file, site)
     _check_things(file, site)
     return site
