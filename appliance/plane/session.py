@@ -104,6 +104,11 @@ class Session:
         """Sessions linked to directly just now, however they came about."""
         return len(list(self._raw.info.peers_zid())) + len(list(self._raw.info.routers_zid()))
 
+    @property
+    def missed(self) -> int:
+        """Messages that arrived and were dropped because the queue to the event loop was full."""
+        return self._inbox.dropped
+
     # --- facts ------------------------------------------------------------------------------------------------
 
     def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:

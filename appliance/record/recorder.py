@@ -11,7 +11,7 @@ import time
 from typing import Protocol
 
 import structlog
-from msgspec import structs
+from msgspec import Struct, structs
 
 from appliance.errors import RecordError
 from appliance.model import encode
@@ -34,6 +34,15 @@ class Closer(Protocol):
     def close(self) -> None: ...  # noqa: D102
 
 
+class Drop(Struct, frozen=True):
+    """Messages that did not fit: how many, their bytes, and key and time of the last."""
+
+    count: int = 0
+    payload_bytes: int = 0
+    key: str = ""
+    at_ns: int = 0
+
+
 class Intake:
     """Messages between the event loop and the writer thread, bounded by number and by bytes.
 
@@ -46,34 +55,37 @@ class Intake:
         self._some = threading.Event()
         self._waiting: list[LoggedMessage] = []
         self._bytes = 0
-        self._dropped = 0
-        self._dropped_bytes = 0
-        self._dropped_last = ("", 0)
+        self._drops: dict[str, Drop] = {}
 
     def put(self, message: LoggedMessage) -> bool:
         """Add a message; False when it was dropped."""
         size = len(message.payload)
         with self._lock:
             full = len(self._waiting) >= self._most or self._bytes + size > self._most_bytes
-            if full:
-                self._dropped += 1
-                self._dropped_bytes += size
-                self._dropped_last = (message.key, message.at_ns)
-            else:
+            if not full:
                 self._waiting.append(message)
                 self._bytes += size
+        if full:
+            self.lose("queue full", Drop(1, size, message.key, message.at_ns))
         self._some.set()
         return not full
 
-    def take(self, wait_s: float) -> tuple[list[LoggedMessage], tuple[int, int, str, int]]:
-        """Return all that waits, and (number, bytes, last key, last time) dropped since the last take."""
+    def lose(self, reason: str, drop: Drop) -> None:
+        """Count messages that were lost here or before they came here."""
+        with self._lock:
+            old = self._drops.get(reason, Drop())
+            self._drops[reason] = Drop(
+                old.count + drop.count, old.payload_bytes + drop.payload_bytes, drop.key, drop.at_ns
+            )
+
+    def take(self, wait_s: float) -> tuple[list[LoggedMessage], dict[str, Drop]]:
+        """Return all that waits, and what was dropped since the last take, by reason."""
         self._some.wait(wait_s)
         with self._lock:
             self._some.clear()
             out, self._waiting, self._bytes = self._waiting, [], 0
-            dropped = (self._dropped, self._dropped_bytes, *self._dropped_last)
-            self._dropped = self._dropped_bytes = 0
-        return out, dropped
+            drops, self._drops = self._drops, {}
+        return out, drops
 
     def wake(self) -> None:
         """End a waiting `take`."""
@@ -103,6 +115,7 @@ class Recorder:
         self._subscription: Closer | None = None
         self._reporting: asyncio.Task[None] | None = None
         self._status = RecorderStatus(id=config.name, fleet=session.keys.fleet, started_ns=time.time_ns())
+        self._lost_before: dict[str, int] = {}
         self.failed = ""
         """Why the writer thread ended by itself; empty while all is well."""
 
@@ -133,6 +146,7 @@ class Recorder:
         thread = self._thread
         if thread is None:
             return
+        self._look_for_losses()
         self._stopping.set()
         self._intake.wake()
         await asyncio.to_thread(thread.join, _STOP_S)
@@ -167,12 +181,11 @@ class Recorder:
             log.exception("log writer failed")
             self._snapshot("failed", self.failed)
 
-    def _write(self, batch: list[LoggedMessage], dropped: tuple[int, int, str, int]) -> None:
-        count, size, key, at_ns = dropped
+    def _write(self, batch: list[LoggedMessage], drops: dict[str, Drop]) -> None:
         for message in batch:
             self._writer.write(message)
-        if count:
-            self._writer.drop("queue full", key, size, at_ns, count=count)
+        for reason, drop in drops.items():
+            self._writer.drop(reason, drop.key, drop.payload_bytes, drop.at_ns, count=drop.count)
         self._writer.tick()
         self._snapshot("recording" if self._writer.recording or not self._writer.problem else "paused")
 
@@ -189,8 +202,18 @@ class Recorder:
             dropped=dict(writer.dropped),
         )
 
+    def _look_for_losses(self) -> None:
+        """Count what the session itself dropped before it came here: too large, or faster than this process."""
+        large = sum(count for what, count in self._session.refused.items() if what.startswith("oversize"))
+        for reason, now in (("queue full", self._session.missed), ("too large", large)):
+            fresh = now - self._lost_before.get(reason, 0)
+            if fresh > 0:
+                self._intake.lose(reason, Drop(fresh, at_ns=time.time_ns()))
+            self._lost_before[reason] = now
+
     async def _report(self) -> None:
         while True:
+            self._look_for_losses()
             self._publish()
             await asyncio.sleep(self._config.status_s)
 

@@ -1,0 +1,238 @@
+"""The recorder on real Zenoh sessions, in this process and in one of its own that is killed."""
+
+import asyncio
+import contextlib
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from mcap.reader import make_reader
+
+from appliance.errors import RecordError
+from appliance.model import GatewayStatus, Notice, encode
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.record.facts import Gap, LoggedMessage, RecorderStatus
+from appliance.record.reader import info, read, recover
+from appliance.record.recorder import Recorder, run_recorder
+from appliance.record.settings import RecordConfig
+
+pytestmark = pytest.mark.anyio
+
+PROCESS = """
+import asyncio, sys
+from appliance.plane.settings import PlaneConfig
+from appliance.record.recorder import run_recorder
+from appliance.record.settings import RecordConfig
+config = RecordConfig(directory=sys.argv[2], free_bytes=0, status_s=0.2)
+asyncio.run(run_recorder(config, PlaneConfig(mode="client", connect=(sys.argv[1],)), "f1", asyncio.Event()))
+"""
+
+
+@pytest.fixture
+async def gateway(free_port: int) -> AsyncIterator[Session]:
+    """Open a session that others connect to, as a gateway's."""
+    session = await Session.open(PlaneConfig(listen=(f"tcp/127.0.0.1:{free_port}",)), "f1")
+    yield session
+    await session.close()
+
+
+def _client(gateway: Session) -> PlaneConfig:
+    return PlaneConfig(mode="client", connect=gateway.config.listen)
+
+
+async def _until(condition: Callable[[], object]) -> None:
+    """Wait until something is so; the test's own timeout bounds it."""
+    while not condition():
+        await asyncio.sleep(0.02)
+
+
+@contextlib.asynccontextmanager
+async def _recording(gateway: Session, config: RecordConfig) -> AsyncIterator[Recorder]:
+    """Record with a session of its own, heard of by the gateway before the body runs."""
+    session = await Session.open(_client(gateway), "f1")
+    recorder = Recorder(session, config)
+    heard = asyncio.Event()
+    closer = gateway.subscribe(gateway.keys.recorder_status(), lambda _: heard.set())
+    try:
+        await recorder.start()
+        await asyncio.wait_for(heard.wait(), 10)
+        while recorder.stats.messages == 0:  # its subscription has reached the gateway when a put comes back
+            gateway.put(f"{gateway.keys.root}/probe", b"{}")
+            await asyncio.sleep(0.05)
+        yield recorder
+    finally:
+        await recorder.stop()
+        closer.close()
+        await session.close()
+
+
+async def test_what_is_put_is_read_back(gateway: Session, tmp_path: Path) -> None:
+    """Everything put and deleted over Zenoh is in a finished file, in order, with Zenoh's times and encodings."""
+    keys = gateway.keys
+    status = encode(GatewayStatus(id="g1", fleet="f1", load=0.5))
+    notice = encode(Notice(id="n", to="ops", text="done", at_ns=5))
+    before = time.time_ns()
+    async with _recording(gateway, RecordConfig(directory=str(tmp_path), status_s=0.1)) as recorder:
+        gateway.put(keys.status("g1"), status)
+        gateway.put(keys.mavlink("d1", "rx"), b"\xfd\x00\x01", encoding="application/octet-stream")
+        gateway.put(keys.notice("ops"), notice)
+        for number in range(500):
+            gateway.put(keys.transition("t1"), encode({"n": number}))
+        gateway.delete(keys.container("g1", "c1"))
+        await _until(lambda: recorder.stats.messages >= 505)
+    (path,) = tmp_path.glob("*.mcap")
+    found = [message for message in read(path) if "/recorder/" not in message.key and not message.key.endswith("probe")]
+    assert [(message.key, message.payload) for message in found[:3]] == [
+        (keys.status("g1"), status),
+        (keys.mavlink("d1", "rx"), b"\xfd\x00\x01"),
+        (keys.notice("ops"), notice),
+    ]
+    assert [msgspec.json.decode(message.payload)["n"] for message in found[3:503]] == list(range(500))
+    assert (found[503].key, found[503].deleted) == (keys.container("g1", "c1"), True)
+    assert found[0].encoding == "application/json"
+    assert all(before <= message.at_ns <= time.time_ns() for message in found)
+    told = info(path)
+    assert not told.recovered
+    assert told.metadata["fleet"] == "f1"
+    with path.open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == told.messages
+    assert "swiftbot.GatewayStatus" in {schema.name for schema in summary.schemas.values()}
+
+
+async def test_status_is_put(gateway: Session, tmp_path: Path) -> None:
+    """The recorder puts its account of itself, and a last one when it has stopped."""
+    heard: list[RecorderStatus] = []
+    gateway.subscribe_typed(
+        gateway.keys.recorder_status(), RecorderStatus, lambda _, status: heard.append(status) if status else None
+    )
+    async with _recording(gateway, RecordConfig(directory=str(tmp_path), status_s=0.1, name="rec1")):
+        await _until(lambda: any(status.messages for status in heard))
+    await _until(lambda: heard[-1].state == "stopped")
+    assert heard[-1].id == "rec1"
+    assert {status.state for status in heard} <= {"starting", "recording", "stopped"}
+
+
+async def test_oversize_payload_is_a_gap(gateway: Session, tmp_path: Path) -> None:
+    """A payload over the recorder's bound is not in the log, and the log says that one is missing."""
+    config = RecordConfig(directory=str(tmp_path), message_bytes=1000, status_s=0.1)
+    async with _recording(gateway, config) as recorder:
+        gateway.put(gateway.keys.transition("t1"), b"x" * 5000)
+        await _until(lambda: recorder.stats.dropped.get("too large"))
+    (path,) = tmp_path.glob("*.mcap")
+    gaps = [msgspec.json.decode(message.payload, type=Gap) for message in read(path, keys="swiftbot/*/recorder/*/gap")]
+    assert [(gap.reason, gap.dropped, gap.payload_bytes) for gap in gaps] == [("too large", 1, 5000)]
+
+
+async def test_malformed_payloads_are_kept(gateway: Session, tmp_path: Path) -> None:
+    """Garbage on a typed key is evidence: it is in the log byte for byte."""
+    async with _recording(gateway, RecordConfig(directory=str(tmp_path), status_s=0.1)) as recorder:
+        gateway.put(gateway.keys.log("g1"), b"\xff{not json")
+        gateway.put(gateway.keys.status("g1"), b"", encoding="text/plain")
+        await _until(lambda: recorder.stats.messages >= 3)
+    (path,) = tmp_path.glob("*.mcap")
+    found = {message.key: message.payload for message in read(path)}
+    assert found[gateway.keys.log("g1")] == b"\xff{not json"
+    assert found[gateway.keys.status("g1")] == b""
+
+
+async def test_killed_recorder_loses_at_most_a_second(gateway: Session, tmp_path: Path, project_root: Path) -> None:
+    """After SIGKILL at 500 messages/s all but the last second can be read, in order, and made a proper file."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        PROCESS,
+        gateway.config.listen[0],
+        str(tmp_path),
+        env=os.environ | {"PYTHONPATH": str(project_root)},
+    )
+    sent: list[tuple[int, int]] = []
+    try:
+        recording = asyncio.Event()
+        gateway.subscribe(gateway.keys.recorder_status(), lambda _: recording.set())
+        await asyncio.wait_for(recording.wait(), 30)
+        started = time.monotonic()
+        while (passed := time.monotonic() - started) < 2.5:
+            while len(sent) < passed * 500:
+                sent.append((len(sent), time.monotonic_ns()))
+                gateway.put(gateway.keys.transition("t1"), encode({"n": len(sent) - 1}))
+            await asyncio.sleep(0.01)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        await process.wait()
+    killed_ns = time.monotonic_ns()
+    (path,) = tmp_path.glob("*.mcap")
+    told = info(path)
+    assert told.recovered
+    numbers = [msgspec.json.decode(message.payload)["n"] for message in read(path, keys=gateway.keys.transition())]
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    older = [number for number, at_ns in sent if killed_ns - at_ns > 1e9]
+    assert numbers[-1] >= older[-1]
+    assert numbers[0] <= 5  # those put before its subscription had reached us
+    assert recover(path, tmp_path / "whole.mcap").messages == told.messages
+    with (tmp_path / "whole.mcap").open("rb") as stream:
+        again = [message for _, channel, message in make_reader(stream).iter_messages(gateway.keys.transition("t1"))]
+    assert len(again) == len(numbers)
+
+
+async def test_file_size_limit_of_the_system(gateway: Session, tmp_path: Path) -> None:
+    """When the system itself refuses to let the file grow, it is ended whole, and a new one tells of the gap."""
+    # SIGXFSZ would kill the process: the recorder's process ignores it, as Python does by default.
+    assert signal.getsignal(signal.SIGXFSZ) == signal.SIG_IGN
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    config = RecordConfig(directory=str(tmp_path), chunk_bytes=2000, compression="none", free_bytes=0, status_s=5.0)
+    async with _recording(gateway, config) as recorder:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+        try:
+            for number in range(300):
+                gateway.put(gateway.keys.transition("t1"), encode({"n": number, "x": "y" * 100}))
+            await _until(lambda: recorder.stats.problem)
+            assert "the disk is full" in recorder.stats.problem
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        await _until(lambda: recorder.stats.state == "recording" and recorder.stats.files >= 2)
+        gateway.put(gateway.keys.transition("t1"), encode({"n": 300}))
+        expected = recorder.stats.messages + 1
+        await _until(lambda: recorder.stats.messages >= expected)
+    files = sorted(tmp_path.glob("*.mcap"))
+    messages: list[LoggedMessage] = [message for path in files for message in read(path)]
+    numbers = [
+        msgspec.json.decode(message.payload)["n"]
+        for message in messages
+        if message.key == gateway.keys.transition("t1")
+    ]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == 300
+    dropped = sum(info(path).dropped for path in files)
+    assert len(numbers) + dropped == 301
+
+
+async def test_folder_that_cannot_be_written_is_told(gateway: Session, tmp_path: Path) -> None:
+    """The recorder's process ends with the cause and the remedy when its folder cannot be made."""
+    (tmp_path / "file").write_text("")
+    config = RecordConfig(directory=str(tmp_path / "file" / "log"))
+    with pytest.raises(RecordError, match=r"set record\.directory"):
+        await run_recorder(config, _client(gateway), "f1", asyncio.Event())
+
+
+async def test_stop_ends_the_process_with_a_finished_file(gateway: Session, tmp_path: Path) -> None:
+    """Setting `stop` ends `run_recorder`, and what it leaves is a finished file."""
+    stop = asyncio.Event()
+    heard = asyncio.Event()
+    gateway.subscribe(gateway.keys.recorder_status(), lambda _: heard.set())
+    config = RecordConfig(directory=str(tmp_path), status_s=0.1)
+    running: Awaitable[None] = asyncio.create_task(run_recorder(config, _client(gateway), "f1", stop))
+    await asyncio.wait_for(heard.wait(), 10)
+    stop.set()
+    await running
+    (path,) = tmp_path.glob("*.mcap")
+    assert not info(path).recovered

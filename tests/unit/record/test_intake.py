@@ -1,0 +1,39 @@
+"""The bounded queue between the event loop and the writer thread."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.record.facts import LoggedMessage
+from appliance.record.recorder import Drop, Intake
+
+
+def _message(size: int) -> LoggedMessage:
+    return LoggedMessage("k", 5, b"x" * size)
+
+
+@given(sizes=st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=60))
+def test_nothing_is_lost_silently(sizes: list[int | None]) -> None:
+    """Whatever comes (None: the writer takes), each message is taken in order or counted, within both bounds."""
+    intake = Intake(messages=5, payload_bytes=100)
+    came = taken = dropped = 0
+    for size in [*sizes, None]:
+        if size is None:
+            out, drops = intake.take(0)
+            assert len(out) <= 5
+            assert sum(len(message.payload) for message in out) <= 100
+            taken += len(out)
+            dropped += drops.get("queue full", Drop()).count
+        else:
+            came += 1
+            intake.put(_message(size))
+    assert came == taken + dropped
+    assert len(intake) == 0
+
+
+def test_losses_by_reason() -> None:
+    """Losses elsewhere are handed over under their own reason, once."""
+    intake = Intake(messages=5, payload_bytes=100)
+    intake.lose("too large", Drop(2, 10, "a", 1))
+    intake.lose("too large", Drop(1, 5, "b", 2))
+    assert intake.take(0)[1] == {"too large": Drop(3, 15, "b", 2)}
+    assert intake.take(0)[1] == {}
