@@ -238,7 +238,7 @@ def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
     return _stop_rest(replace(failed, state=TaskState.CANCELLING, failure=failure))
 
 
-def _cancel(record: TaskRecord, event: Transition) -> TaskRecord:
+def _cancel(record: TaskRecord, _: Transition) -> TaskRecord:
     if record.state is TaskState.CANCELLING:
         raise StaleTransitionError(f"task {record.id} is being cancelled already")
     return _stop_rest(replace(record, state=TaskState.CANCELLING, failure=None))
