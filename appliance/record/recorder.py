@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 import structlog
@@ -26,6 +27,8 @@ log = structlog.get_logger(__name__)
 _STOP_S = 30.0
 """How long a stop waits for the thread: a slow disk may hold many queued pictures."""
 _TICK_S = 0.1
+_STUCK_S = 10.0
+"""A writer thread that has not come round for so long is no longer called alive."""
 
 
 class Closer(Protocol):
@@ -116,6 +119,7 @@ class Recorder:
         self._reporting: asyncio.Task[None] | None = None
         self._status = RecorderStatus(id=config.name, fleet=session.keys.fleet, started_ns=time.time_ns())
         self._lost_before: dict[str, int] = {}
+        self._moved_at = time.monotonic()
         self.failed = ""
         """Why the writer thread ended by itself; empty while all is well."""
 
@@ -187,6 +191,7 @@ class Recorder:
         for reason, drop in drops.items():
             self._writer.drop(reason, drop.key, drop.payload_bytes, drop.at_ns, count=drop.count)
         self._writer.tick()
+        self._moved_at = time.monotonic()
         self._snapshot("recording" if self._writer.recording or not self._writer.problem else "paused")
 
     def _snapshot(self, state: str, problem: str = "") -> None:
@@ -201,6 +206,11 @@ class Recorder:
             file_bytes=writer.file_bytes,
             dropped=dict(writer.dropped),
         )
+
+    @property
+    def stuck_s(self) -> float:
+        """How long the writer thread has not come round: a disk that does not answer holds it."""
+        return time.monotonic() - self._moved_at
 
     def _look_for_losses(self) -> None:
         """Count what the session itself dropped before it came here: too large, or faster than this process."""
@@ -221,8 +231,23 @@ class Recorder:
         self._session.put(self._session.keys.recorder_status(self._config.name), encode(self.stats))
 
 
-async def run_recorder(config: RecordConfig, plane_config: PlaneConfig, fleet: str, stop: asyncio.Event) -> None:
+async def run_recorder(
+    config: RecordConfig,
+    plane_config: PlaneConfig,
+    fleet: str,
+    stop: asyncio.Event,
+    *,
+    alive: Callable[[RecorderStatus], None] | None = None,
+) -> None:
     """Record a fleet until `stop` is set, in a process of its own (`swiftbot record`).
+
+    Args:
+        config: Where and how.
+        plane_config: How to reach the fleet.
+        fleet: Its name.
+        stop: Ends it; what waits is written and the file finished.
+        alive: Called when it has begun and then every `status_s` while the writer thread moves: a hook for the
+            service manager's readiness and watchdog.
 
     Raises:
         ConfigError: a setting cannot work.
@@ -236,6 +261,8 @@ async def run_recorder(config: RecordConfig, plane_config: PlaneConfig, fleet: s
         await recorder.start()
         try:
             while not stop.is_set() and not recorder.failed:
+                if alive is not None and recorder.stuck_s < _STUCK_S:
+                    alive(recorder.stats)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(config.status_s):
                         await stop.wait()

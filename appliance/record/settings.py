@@ -8,7 +8,8 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from appliance.errors import ConfigError
+from appliance.errors import ConfigError, PayloadError
+from appliance.plane.keys import check_name
 
 
 class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,6 +46,10 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def check(self) -> None:
         """Raise ConfigError for values that cannot work, naming the key."""
+        try:
+            check_name(self.name, "record.name")
+        except PayloadError as error:
+            raise ConfigError(error.message, remedy=error.remedy) from error
         if self.compression not in ("zstd", "lz4", "none"):
             raise ConfigError(f"record.compression is {self.compression!r}", remedy="choose one of: zstd, lz4, none")
         for key in ("chunk_bytes", "rotate_bytes", "queue_messages", "queue_bytes", "message_bytes", "max_channels"):

@@ -22,6 +22,7 @@ from appliance.record.facts import Gap, LoggedMessage, RecorderStatus
 from appliance.record.reader import info, read, recover
 from appliance.record.recorder import Recorder, run_recorder
 from appliance.record.settings import RecordConfig
+from appliance.record.writer import LogWriter
 
 pytestmark = pytest.mark.anyio
 
@@ -224,14 +225,42 @@ async def test_folder_that_cannot_be_written_is_told(gateway: Session, tmp_path:
         await run_recorder(config, _client(gateway), "f1", asyncio.Event())
 
 
+class BrokenWriter(LogWriter):
+    """A writer with a defect."""
+
+    def write(self, message: LoggedMessage) -> bool:
+        """Fail as no disk does."""
+        raise ZeroDivisionError(message.key)
+
+
+async def test_defect_of_the_writer_is_told(gateway: Session, tmp_path: Path) -> None:
+    """A writer thread that fails says so in the status instead of recording nothing in silence."""
+    heard: list[RecorderStatus] = []
+    gateway.subscribe_typed(
+        gateway.keys.recorder_status(), RecorderStatus, lambda _, status: heard.append(status) if status else None
+    )
+    session = await Session.open(_client(gateway), "f1")
+    config = RecordConfig(directory=str(tmp_path), status_s=0.1)
+    recorder = Recorder(session, config, writer=BrokenWriter(config, fleet="f1"))
+    await recorder.start()
+    await _until(lambda: any(status.state == "failed" for status in heard))
+    assert "ZeroDivisionError" in recorder.failed
+    await recorder.stop()
+    await session.close()
+
+
 async def test_stop_ends_the_process_with_a_finished_file(gateway: Session, tmp_path: Path) -> None:
     """Setting `stop` ends `run_recorder`, and what it leaves is a finished file."""
     stop = asyncio.Event()
     heard = asyncio.Event()
+    alive: list[RecorderStatus] = []
     gateway.subscribe(gateway.keys.recorder_status(), lambda _: heard.set())
     config = RecordConfig(directory=str(tmp_path), status_s=0.1)
-    running: Awaitable[None] = asyncio.create_task(run_recorder(config, _client(gateway), "f1", stop))
+    running: Awaitable[None] = asyncio.create_task(
+        run_recorder(config, _client(gateway), "f1", stop, alive=alive.append)
+    )
     await asyncio.wait_for(heard.wait(), 10)
+    await _until(lambda: len(alive) >= 2)
     stop.set()
     await running
     (path,) = tmp_path.glob("*.mcap")

@@ -252,7 +252,7 @@ def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"compression": "rar"}, {"chunk_bytes": 0}, {"flush_s": 0.0}, {"max_channels": 70_000}]
+    "changes", [{"compression": "rar"}, {"chunk_bytes": 0}, {"flush_s": 0.0}, {"max_channels": 70_000}, {"name": "a/*"}]
 )
 def test_settings_that_cannot_work(changes: dict[str, Any]) -> None:
     """Each wrong setting is named."""

@@ -1,0 +1,215 @@
+"""The terminal UI against real Zenoh sessions: a small stand-in gateway answers its questions."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+
+import pytest
+import structlog
+from textual.pilot import Pilot
+
+from appliance.errors import PlanError
+from appliance.model import (
+    ContainerInfo,
+    ContainerState,
+    GatewayStatus,
+    LogLine,
+    Notice,
+    Plan,
+    RobotInfo,
+    RunEvent,
+    RunEventKind,
+    Subtask,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskRequest,
+    TaskState,
+    encode,
+)
+from appliance.plane.rpc import Rpc
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tui.app import SwiftbotApp
+from appliance.tui.data import FleetView
+from appliance.tui.settings import TuiConfig
+
+pytestmark = pytest.mark.anyio
+
+PLAN = Plan(domain="patrol", subtasks=(Subtask(id="s1", skill="goto", robot="r1"),))
+OLD = TaskRecord(id="t-old", instruction="an older task", state=TaskState.SUCCEEDED, created_ns=1, sequence=3)
+CONFIG = TuiConfig(refresh_hz=10.0, reconnect_s=0.2, silence_s=1.0, resync_s=5.0, call_timeout_s=5.0)
+
+
+class Gateway:
+    """A gateway as the terminal UI sees one: token, status, and the verbs `plan`, `submit`, `tasks`, `cancel`."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.keys = session.keys
+        self.submitted: list[TaskRequest] = []
+        self.cancelled: list[str] = []
+        self._rpc = Rpc(session, "gw-a")
+        self._rpc.register("plan", PlanAsk, self._plan)
+        self._rpc.register("submit", TaskRequest, self._submit)
+        self._rpc.register("tasks", TasksAsk, self._tasks)
+        self._rpc.register("cancel", TaskAsk, self._cancel)
+        session.declare_alive(self.keys.alive("gw-a"))
+        self._beat = asyncio.create_task(self._run())
+
+    async def _plan(self, ask: PlanAsk) -> PlanAnswer:
+        if "sing" in ask.instruction:
+            raise PlanError("no skill for it", remedy="say what to do", problems=("'sing' is no skill",))
+        return PlanAnswer(plan=PLAN)
+
+    async def _submit(self, request: TaskRequest) -> TaskRecord:
+        self.submitted.append(request)
+        record = TaskRecord(id=request.id, instruction=request.instruction, plan=request.plan, created_ns=2)
+        self.session.put(self.keys.task(request.id), encode(record))
+        return record
+
+    async def _tasks(self, ask: TasksAsk) -> TaskList:
+        return TaskList(tasks=(OLD,)[: ask.limit])
+
+    async def _cancel(self, ask: TaskAsk) -> TaskRecord:
+        self.cancelled.append(ask.id)
+        return TaskRecord(id=ask.id, instruction="x", state=TaskState.CANCELLING, created_ns=2, sequence=9)
+
+    async def _run(self) -> None:
+        status = GatewayStatus(id="gw-a", fleet="f1", load=0.25, containers=1, ready=1, limits_enforced=False)
+        container = ContainerInfo(id="c-one", gateway="gw-a", image="base", state=ContainerState.READY)
+        while True:
+            self.session.put(self.keys.status("gw-a"), encode(status))
+            self.session.put(self.keys.container("gw-a", "c-one"), encode(container))
+            self.session.put(self.keys.robot("r1"), encode(RobotInfo(id="r1", kind="zenoh")))
+            await asyncio.sleep(0.1)
+
+    async def close(self) -> None:
+        """Vanish."""
+        self._beat.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._beat
+        await self.session.close()
+
+
+async def _gateway(port: int) -> Gateway:
+    return Gateway(await Session.open(PlaneConfig(listen=(f"tcp/127.0.0.1:{port}",)), "f1"))
+
+
+@pytest.fixture
+async def gateway(free_port: int) -> AsyncIterator[Gateway]:
+    """Run a stand-in gateway."""
+    made = await _gateway(free_port)
+    yield made
+    await made.close()
+
+
+@pytest.fixture
+def app(free_port: int) -> SwiftbotApp:
+    """Return the terminal UI of the fleet at the free port."""
+    plane = PlaneConfig(mode="client", connect=(f"tcp/127.0.0.1:{free_port}",), connect_timeout_s=0.5)
+    return SwiftbotApp(FleetView(plane, "f1", CONFIG), CONFIG)
+
+
+def _seen(app: SwiftbotApp) -> str:
+    strips = app.screen._compositor.render_strips()
+    return "\n".join("".join(segment.text for segment in strip) for strip in strips)
+
+
+async def _see(app: SwiftbotApp, pilot: Pilot[None], *wanted: str | Callable[[str], bool]) -> str:
+    """Wait until the screen shows all that is wanted; the test's own timeout bounds it."""
+    while True:
+        text = _seen(app)
+        if all(part in text if isinstance(part, str) else part(text) for part in wanted):
+            return text
+        await pilot.pause(0.05)
+
+
+async def test_fleet_and_pool_are_live(gateway: Gateway, app: SwiftbotApp) -> None:
+    """Gateways, containers and robots put on their keys are on the screens, limits not enforced among them."""
+    async with app.run_test(size=(80, 24)) as pilot:
+        await _see(app, pilot, "gw-a", "25%", "1/1", "r1", "limits are not enforced", "f1 · 1 gw · 1 robots")
+        await pilot.press("3")
+        await _see(app, pilot, "c-one", "ready")
+
+
+async def test_task_from_instruction_to_end(gateway: Gateway, app: SwiftbotApp) -> None:
+    """An instruction is planned by the gateway, submitted with that plan, and followed to its end."""
+    async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.press("2")
+        await _see(app, pilot, "t-old", "an older task")
+        await pilot.press("s", *"walk", "enter")
+        await _see(app, pilot, "patrol: 1 subtask", "s1 goto r1", "Enter runs this plan")
+        assert gateway.submitted == []
+        await pilot.press("enter")
+        await _see(app, pilot, "walk", "accepted")
+        (request,) = gateway.submitted
+        assert request.plan == PLAN
+        running = TaskRecord(
+            id=request.id,
+            instruction="walk",
+            plan=PLAN,
+            state=TaskState.RUNNING,
+            created_ns=2,
+            sequence=2,
+            subtasks=(SubtaskRecord(subtask=PLAN.subtasks[0], state=SubtaskState.RUNNING, progress=0.25),),
+        )
+        gateway.session.put(gateway.keys.task(request.id), encode(running))
+        await _see(app, pilot, "● s1 goto r1", "25%")
+        await pilot.press("c", "y")
+        await _see(app, pilot, "cancelling")
+        assert gateway.cancelled == [request.id]
+
+
+async def test_refusal_comes_through(gateway: Gateway, app: SwiftbotApp) -> None:
+    """The gateway's own words on an instruction without a plan are shown, with the remedy."""
+    async with app.run_test(size=(80, 24)) as pilot:
+        await _see(app, pilot, "gw-a")
+        await pilot.press("s", *"sing", "enter")
+        await _see(app, pilot, "no skill for it", "say what to do")
+        assert gateway.submitted == []
+
+
+async def test_log_is_live(gateway: Gateway, app: SwiftbotApp) -> None:
+    """Notices, run events and log lines are on the log screen; a malformed one is counted and does no harm."""
+    async with app.run_test(size=(80, 24)) as pilot:
+        await _see(app, pilot, "gw-a")
+        await pilot.press("4")
+        keys, session = gateway.keys, gateway.session
+        session.put(keys.log("gw-a"), b"\xff{")
+        session.put(keys.notice("ops"), b"[1, 2")
+        session.put(keys.log("gw-a"), encode(LogLine(at_ns=1, level="error", source="gw-a", event="container died")))
+        session.put(keys.notice("ops"), encode(Notice(id="n", to="ops", text="patrol over", at_ns=1)))
+        event = RunEvent(task="t", subtask="s1", attempt=1, kind=RunEventKind.STARTED, gateway="gw-a", startup_ms=2.5)
+        session.put(keys.run("t", "s1"), encode(event))
+        await _see(app, pilot, "container died", "patrol over", "t/s1 · started · start 2.5 ms")
+
+
+async def test_lost_gateway_comes_back(app: SwiftbotApp, free_port: int) -> None:
+    """Without a gateway the banner names cause and remedy; when one comes, and after it was lost, all is live."""
+    async with app.run_test(size=(100, 24)) as pilot:
+        await _see(app, pilot, "✘", "swiftbot up")
+        await pilot.press("s", *"walk", "enter")
+        await _see(app, pilot, "not connected")
+        await pilot.press("escape")
+        first = await _gateway(free_port)
+        await _see(app, pilot, "gw-a", lambda text: "swiftbot up" not in text)
+        await first.close()
+        await _see(app, pilot, "✘", "swiftbot up")
+        second = await _gateway(free_port)
+        await _see(app, pilot, "gw-a", lambda text: "swiftbot up" not in text)
+        await second.close()
+
+
+def test_own_log_lines_go_to_the_log_screen(free_port: int) -> None:
+    """A log line of this process is taken from the terminal and shown on the log screen."""
+    view = FleetView(PlaneConfig(mode="client", connect=(f"tcp/127.0.0.1:{free_port}",)), "f1")
+    before = structlog.get_config()
+    try:
+        structlog.configure(processors=[view.take_own_log])
+        structlog.get_logger("x").warning("refused", what="malformed log")
+    finally:
+        structlog.configure(**before)
+    (entry,) = view.snapshot().entries
+    assert (entry.source, entry.level, entry.text) == ("tui", "warning", "refused what=malformed log")
