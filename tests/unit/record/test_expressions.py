@@ -2,7 +2,7 @@
 
 import pytest
 import zenoh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.record.expressions import matches
@@ -12,6 +12,7 @@ _KEY = st.lists(_CHUNK, min_size=1, max_size=5).map("/".join)
 _EXPRESSION = st.lists(st.sampled_from(["a", "b", "ab", "*", "**", "a$*"]), min_size=1, max_size=5).map("/".join)
 
 
+@settings(deadline=None)
 @given(expression=_EXPRESSION, key=_KEY)
 def test_agrees_with_zenoh(expression: str, key: str) -> None:
     """The matcher says of every expression and key what Zenoh itself says."""

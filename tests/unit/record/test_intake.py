@@ -1,6 +1,6 @@
 """The bounded queue between the event loop and the writer thread."""
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.record.facts import LoggedMessage
@@ -11,6 +11,7 @@ def _message(size: int) -> LoggedMessage:
     return LoggedMessage("k", 5, b"x" * size)
 
 
+@settings(deadline=None)
 @given(sizes=st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=60))
 def test_nothing_is_lost_silently(sizes: list[int | None]) -> None:
     """Whatever comes (None: the writer takes), each message is taken in order or counted, within both bounds."""

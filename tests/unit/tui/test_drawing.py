@@ -1,6 +1,6 @@
 """Text made of facts."""
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import Plan, RunEvent, RunEventKind, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
@@ -23,6 +23,7 @@ def plans(draw: st.DrawFn) -> Plan:
     return Plan(domain="d", subtasks=tuple(draw(st.permutations(subtasks))))
 
 
+@settings(deadline=None)
 @given(plan=plans())
 def test_every_subtask_once_and_below_its_predecessors(plan: Plan) -> None:
     """The drawing has each subtask once, below all those it comes after, and deeper than them."""
@@ -44,6 +45,7 @@ def test_cycle_is_drawn_all_the_same() -> None:
     assert drawing.plan_text(plan).plain.count("└─▶") >= 1
 
 
+@settings(deadline=None)
 @given(fraction=st.floats(allow_nan=False))
 def test_bar_has_its_width(fraction: float) -> None:
     """A progress bar is as wide as it should be for any number that a skill reports."""
@@ -73,6 +75,7 @@ def test_board_keeps_the_later_record() -> None:
     assert board.tasks == (new,)
 
 
+@settings(deadline=None)
 @given(numbers=st.lists(st.integers(0, 60), max_size=80))
 def test_board_is_bounded(numbers: list[int]) -> None:
     """However many tasks and lines come, only the newest are kept, newest task first."""
