@@ -1,4 +1,4 @@
-"""One small fake of `ctx` at the seam between handlers and the appliance, and the handlers loaded as the runner does."""
+"""A small fake of `ctx`, the seam between handlers and appliance, and handlers loaded as the runner does."""
 
 import hashlib
 import importlib.util
@@ -17,7 +17,7 @@ from appliance.skills.catalogue import SKILLS
 from appliance.skills.sites import load_site
 
 
-class Fail(Exception):
+class Fail(Exception):  # noqa: N818 - the runner's name for it
     """Stands in for the runner's `ctx.Fail`."""
 
     def __init__(self, message: str, remedy: str = "", retryable: bool = False) -> None:
@@ -53,6 +53,7 @@ class FakeContext:
         self.answers: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
+        """Note the command and answer it: the test's own answer first, else a robot that does everything at once."""
         assert timeout_s > 0
         msgspec.json.encode(args)  # what is sent must be JSON
         self.commands.append((verb, args))
@@ -76,28 +77,35 @@ class FakeContext:
                 return {"did": verb}
 
     def notify(self, to: str, text: str) -> dict[str, Any]:
+        """Note the notice."""
         self.notices.append((to, text))
         return {"notice": f"t1/s1/{len(self.notices)}"}
 
     def put_artifact(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> dict[str, Any]:
+        """Keep the file in memory."""
         digest = hashlib.sha256(data).hexdigest()
         self.files[digest] = data
         return {"artifact": digest, "name": name, "media_type": media_type, "bytes": len(data), "gateway": "gw1"}
 
     def get_artifact(self, ref: dict[str, Any]) -> bytes:
+        """Return a kept file."""
         return self.files[ref["artifact"]]
 
     def progress(self, fraction: float, note: str = "") -> None:
+        """Note the step; a fraction outside 0 to 1 is a handler's mistake."""
         assert 0.0 <= fraction <= 1.0
         self.steps.append((fraction, note))
 
-    def log(self, text: str, **fields: Any) -> None:
+    def log(self, text: str, **fields: Any) -> None:  # noqa: ARG002 - the runner's signature
+        """Note the line."""
         self.logged.append(text)
 
     def partial(self, result: dict[str, Any]) -> None:
+        """Note the partial result."""
         self.partials.append(result)
 
-    def checkpoint(self, data: dict[str, Any]) -> None:
+    def checkpoint(self, data: dict[str, Any]) -> None:  # noqa: ARG002 - the runner's signature
+        """Fail: nobody should."""
         raise AssertionError("no handler keeps checkpoints yet")
 
     def sent(self, verb: str) -> list[dict[str, Any]]:
@@ -105,7 +113,9 @@ class FakeContext:
         return [args for name, args in self.commands if name == verb]
 
 
-def draw(*things: tuple[str, tuple[int, int, int, int]], size: tuple[int, int] = (320, 240), kind: str = "PNG") -> bytes:
+def draw(
+    *things: tuple[str, tuple[int, int, int, int]], size: tuple[int, int] = (320, 240), kind: str = "PNG"
+) -> bytes:
     """Draw a picture as the simulated camera does: sky, floor, grey shelves, and coloured boxes (left, top, w, h)."""
     picture = Image.new("RGB", size, (142, 122, 101))
     pen = ImageDraw.Draw(picture)

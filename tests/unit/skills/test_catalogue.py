@@ -161,14 +161,14 @@ def test_a_wrong_manifest_names_file_and_key(tmp_path: Path, old: str, new: str,
 def test_an_id_may_be_there_once(tmp_path: Path) -> None:
     """A skill that another folder has already is refused, with both folders named."""
     text = MANIFEST.replace('id = "wave"', 'id = "goto"')
-    with pytest.raises(ConfigError, match="goto/skill.toml: id: skill 'goto' is in .*skills/goto too"):
+    with pytest.raises(ConfigError, match=r"goto/skill\.toml: id: skill 'goto' is in .*skills/goto too"):
         load_catalogue([_extra(tmp_path, text, name="goto")])
 
 
 def test_a_folder_without_manifest_is_refused(tmp_path: Path) -> None:
     """A skill folder whose skill.toml is missing is an error, not a skill that silently is not there."""
     (tmp_path / "wave").mkdir()
-    with pytest.raises(ConfigError, match="wave: skill.toml is missing"):
+    with pytest.raises(ConfigError, match=r"wave: skill\.toml is missing"):
         load_catalogue([tmp_path])
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -64,7 +65,7 @@ def test_goto_never_enters_the_forbidden_area(make_ctx: Make, handler: Load) -> 
     ctx = make_ctx(place="goal 2")
     ctx.info["pose"] = {"x": 30.0, "y": 5.0}
     points = [(30.0, 5.0), *((at["x"], at["y"]) for at in handler("goto").run(ctx)["waypoints"])]
-    for (x, y), (to_x, to_y) in zip(points, points[1:], strict=False):
+    for (x, y), (to_x, to_y) in pairwise(points):
         for step in range(101):
             at = (x + (to_x - x) * step / 100, y + (to_y - y) * step / 100)
             assert not (28 < at[0] < 32 and 8 < at[1] < 12)

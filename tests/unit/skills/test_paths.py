@@ -39,16 +39,14 @@ def crosses(box: paths.Rectangle, one: paths.Point, other: paths.Point) -> bool:
 
 @settings(max_examples=60, deadline=None)
 @given(start=point, goal=point, closed=st.lists(boxes(), max_size=8))
-def test_a_way_never_crosses_an_obstacle(
-    start: paths.Point, goal: paths.Point, closed: list[paths.Rectangle]
-) -> None:
+def test_a_way_never_crosses_an_obstacle(start: paths.Point, goal: paths.Point, closed: list[paths.Rectangle]) -> None:
     """A way ends at the goal and no leg of it is inside a closed area; else the planner says that there is none."""
     assume(not any(box.holds(start) or box.holds(goal) for box in closed))
     try:
         way = paths.plan(start, goal, closed)
-    except paths.NoPath as error:
-        assert error.message.startswith("no way from")
-        assert error.remedy
+    except paths.NoPath as none:
+        told = (none.message.split(" (")[0], bool(none.remedy))
+        assert told == ("no way from", True)
         return
     assert way[-1] == goal
     for one, other in pairwise([start, *way]):

@@ -159,7 +159,7 @@ def test_a_broken_picture_is_named(make_ctx: Make, handler: Load, picture: Draw,
     """Bytes that are no picture, or half of one, are refused with the file's name."""
     ctx = make_ctx(target="red box")
     with_picture(ctx, picture(RED)[:200] if isinstance(data, str) else data)
-    with pytest.raises(ctx.Fail, match="shelf-1.png is no picture"):
+    with pytest.raises(ctx.Fail, match=r"shelf-1\.png is no picture"):
         handler("detect").run(ctx)
 
 

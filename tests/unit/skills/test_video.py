@@ -176,5 +176,5 @@ def test_a_video_without_frames_is_a_failure(make_ctx: Make, handler: Load, ffmp
     ffmpeg(frames=0)
     ctx = make_ctx()
     with_video(ctx)
-    with pytest.raises(ctx.Fail, match="aisle.mp4 has no frame"):
+    with pytest.raises(ctx.Fail, match=r"aisle\.mp4 has no frame"):
         handler("extract_frames").run(ctx)
