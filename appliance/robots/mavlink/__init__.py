@@ -1,0 +1,1 @@
+"""MAVLink: frames in and out over UDP, what is known of each vehicle, the command and mission protocols."""

@@ -1,0 +1,192 @@
+"""The one place that touches pymavlink: frames to messages and messages to frames, and the numbers used here.
+
+`ardupilotmega` includes `common`, so one dialect serves ArduPilot and every message of PX4 that is used here. The
+generated classes are untyped in practice (fields appear by name), so the rest of the room sees `Frame`.
+pymavlink's stream parser is not used: it resynchronises across datagrams and hides what it drops, and a gateway
+must count each damaged frame and keep the raw bytes of each good one. Its decoder and encoder are.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+from msgspec import Struct
+from pymavlink.dialects.v20 import ardupilotmega as _dialect
+
+MARKER_V2 = 0xFD
+MARKER_V1 = 0xFE
+_SIGNED = 0x01
+_HEADER_V2, _HEADER_V1, _CHECKSUM, _SIGNATURE = 10, 6, 2, 13
+
+Message = Any
+"""A pymavlink message: fields by name."""
+
+
+class Frame(Struct, frozen=True, kw_only=True):
+    """A frame whose checksum was right: who sent it, which message (`HEARTBEAT`, ...), its fields, its bytes."""
+
+    system: int
+    component: int
+    sequence: int
+    name: str
+    message: Message
+    raw: bytes
+
+
+class Damage(Struct, frozen=True):
+    """Bytes that made no frame: `checksum`, `unknown_message`, `signed`, `truncated`, `incompatible`, `noise`."""
+
+    kind: str
+    length: int
+
+
+class Codec:
+    """Decoder and encoder of one link. `system` and `component` are what it sends as."""
+
+    def __init__(self, system: int, component: int) -> None:
+        self._mav: Any = _dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+        self.system = system
+        self.component = component
+
+    def pack(self, message: Message) -> bytes:
+        """Encode a message as a MAVLink 2 frame with the next sequence number."""
+        raw = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return raw
+
+    def read(self, data: bytes) -> Iterator[Frame | Damage]:
+        """Yield what a datagram (or a piece of a log) holds, in order; never raises, consumes every byte.
+
+        After a damaged frame the search goes on behind it when another frame or the end is there, else at the
+        next marker byte, so that one flipped length byte does not cost the frames that follow.
+        """
+        at = 0
+        while at < len(data):
+            if data[at] not in (MARKER_V2, MARKER_V1):
+                following = _next_marker(data, at + 1)
+                yield Damage("noise", following - at)
+                at = following
+                continue
+            length = frame_length(data, at)
+            if length is None or at + length > len(data):
+                following = _next_marker(data, at + 1)
+                yield Damage("truncated", following - at)
+                at = following
+                continue
+            result = self._decode(data[at : at + length])
+            if isinstance(result, Damage) and at + length < len(data) and data[at + length] not in (253, 254):
+                length = _next_marker(data, at + 1) - at
+                result = Damage(result.kind, length)
+            yield result
+            at += length
+
+    def _decode(self, raw: bytes) -> Frame | Damage:
+        if raw[0] == MARKER_V2 and raw[2] & ~_SIGNED:
+            return Damage("incompatible", len(raw))
+        try:
+            message: Message = self._mav.decode(bytearray(raw))
+        except _dialect.MAVError:
+            return Damage("checksum", len(raw))
+        if isinstance(message, _dialect.MAVLink_unknown):
+            return Damage("unknown_message", len(raw))
+        if raw[0] == MARKER_V2 and raw[2] & _SIGNED:
+            # No key is shared with vehicles, so a signature proves nothing here and may be of another's making.
+            return Damage("signed", len(raw))
+        header = message.get_header()
+        return Frame(
+            system=header.srcSystem,
+            component=header.srcComponent,
+            sequence=header.seq,
+            name=message.get_type(),
+            message=message,
+            raw=raw,
+        )
+
+
+def frame_length(data: bytes, at: int) -> int | None:
+    """Return the length that the header at `at` announces, None when the header is not whole."""
+    if len(data) - at < 3:
+        return None
+    if data[at] == MARKER_V1:
+        return _HEADER_V1 + data[at + 1] + _CHECKSUM
+    return _HEADER_V2 + data[at + 1] + _CHECKSUM + (_SIGNATURE if data[at + 2] & _SIGNED else 0)
+
+
+def _next_marker(data: bytes, start: int) -> int:
+    found = [place for place in (data.find(MARKER_V2, start), data.find(MARKER_V1, start)) if place >= 0]
+    return min(found, default=len(data))
+
+
+def make(name: str, **fields: Any) -> Message:
+    """Make a message by its MAVLink name, such as `make("HEARTBEAT", type=..., ...)`."""
+    kind: Any = getattr(_dialect, f"MAVLink_{name.lower()}_message")
+    return kind(**fields)
+
+
+def constant(name: str) -> int:
+    """Return one of MAVLink's numbers by its name in the dialect."""
+    return int(getattr(_dialect, name))
+
+
+def label(enum: str, value: int) -> str:
+    """Return the name of an enum's value, its number when it has none."""
+    entry: Any = _dialect.enums.get(enum, {}).get(value)
+    return str(value) if entry is None else str(entry.name)
+
+
+ARM = constant("MAV_CMD_COMPONENT_ARM_DISARM")
+TAKEOFF = constant("MAV_CMD_NAV_TAKEOFF")
+LAND = constant("MAV_CMD_NAV_LAND")
+RETURN = constant("MAV_CMD_NAV_RETURN_TO_LAUNCH")
+WAYPOINT = constant("MAV_CMD_NAV_WAYPOINT")
+SET_MODE = constant("MAV_CMD_DO_SET_MODE")
+CHANGE_SPEED = constant("MAV_CMD_DO_CHANGE_SPEED")
+MISSION_START = constant("MAV_CMD_MISSION_START")
+REQUEST_MESSAGE = constant("MAV_CMD_REQUEST_MESSAGE")
+SET_INTERVAL = constant("MAV_CMD_SET_MESSAGE_INTERVAL")
+
+ACCEPTED = constant("MAV_RESULT_ACCEPTED")
+TEMPORARILY_REJECTED = constant("MAV_RESULT_TEMPORARILY_REJECTED")
+DENIED = constant("MAV_RESULT_DENIED")
+UNSUPPORTED = constant("MAV_RESULT_UNSUPPORTED")
+FAILED = constant("MAV_RESULT_FAILED")
+IN_PROGRESS = constant("MAV_RESULT_IN_PROGRESS")
+
+FRAME_RELATIVE = constant("MAV_FRAME_GLOBAL_RELATIVE_ALT_INT")
+FRAME_RELATIVE_OLD = constant("MAV_FRAME_GLOBAL_RELATIVE_ALT")
+FRAME_GLOBAL = constant("MAV_FRAME_GLOBAL_INT")
+MISSION_OK = constant("MAV_MISSION_ACCEPTED")
+MISSION_SEQUENCE = constant("MAV_MISSION_INVALID_SEQUENCE")
+MISSION_CANCELLED = constant("MAV_MISSION_OPERATION_CANCELLED")
+MISSION_NO_SPACE = constant("MAV_MISSION_NO_SPACE")
+MISSION_ERROR = constant("MAV_MISSION_ERROR")
+MISSION_UNSUPPORTED = constant("MAV_MISSION_UNSUPPORTED")
+
+AUTOPILOT_ARDUPILOT = constant("MAV_AUTOPILOT_ARDUPILOTMEGA")
+AUTOPILOT_NONE = constant("MAV_AUTOPILOT_INVALID")
+TYPE_GROUND_STATION = constant("MAV_TYPE_GCS")
+TYPE_ONBOARD = constant("MAV_TYPE_ONBOARD_CONTROLLER")
+TYPE_QUADROTOR = constant("MAV_TYPE_QUADROTOR")
+MULTIROTORS = frozenset(
+    constant(f"MAV_TYPE_{name}")
+    for name in ("QUADROTOR", "HEXAROTOR", "OCTOROTOR", "TRICOPTER", "COAXIAL", "HELICOPTER", "DODECAROTOR")
+)
+COMPONENT_AUTOPILOT = constant("MAV_COMP_ID_AUTOPILOT1")
+ARMED_FLAG = constant("MAV_MODE_FLAG_SAFETY_ARMED")
+CUSTOM_MODE_FLAG = constant("MAV_MODE_FLAG_CUSTOM_MODE_ENABLED")
+STATE_ACTIVE = constant("MAV_STATE_ACTIVE")
+STATE_STANDBY = constant("MAV_STATE_STANDBY")
+
+COPTER_MODES: dict[str, int] = {
+    "STABILIZE": 0,
+    "ALT_HOLD": 2,
+    "AUTO": 3,
+    "GUIDED": 4,
+    "LOITER": 5,
+    "RTL": 6,
+    "LAND": 9,
+    "POSHOLD": 16,
+    "BRAKE": 17,
+    "SMART_RTL": 21,
+}
+"""ArduCopter's custom modes (ArduPilot, ArduCopter/mode.h)."""
+COPTER_MODE_NAMES = {number: name for name, number in COPTER_MODES.items()}

@@ -1,0 +1,107 @@
+"""What may be set about robots: where MAVLink vehicles are listened for, what they are called, how long to wait.
+
+A gateway listens on UDP as ground stations do, and vehicles (or SITL's `--out`, or mavlink-router) send to it.
+Every figure that decides how long something is waited for is here and nowhere else.
+"""
+
+from urllib.parse import urlsplit
+
+from msgspec import Struct, field
+
+from appliance.errors import ConfigError, PayloadError
+from appliance.plane.keys import check_name
+
+MAX_SYSTEM = 255
+
+
+class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One UDP port on which vehicles are heard. `names` maps MAVLink system ids (as text) to robot names."""
+
+    listen: str = "udp://127.0.0.1:14550"
+    """14550 is where ground stations listen; loopback, since MAVLink frames are not authenticated."""
+    names: dict[str, str] = field(default_factory=dict[str, str])
+    prefix: str = "drone_"
+    """Name of a vehicle not in `names`: prefix and system id. Empty: such vehicles are refused."""
+
+    def address(self) -> tuple[str, int]:
+        """Return host and port; ConfigError when `listen` is not `udp://host:port`."""
+        return udp_address(self.listen)
+
+    def name_of(self, system: int) -> str | None:
+        """Return the robot name of a system id, None when such a vehicle is not accepted."""
+        named = self.names.get(str(system))
+        if named is not None:
+            return named
+        return f"{self.prefix}{system}" if self.prefix else None
+
+    def check(self) -> None:
+        """Raise ConfigError for an address, system id or name that cannot be."""
+        self.address()
+        for system, name in self.names.items():
+            if not system.isdecimal() or not 1 <= int(system) <= MAX_SYSTEM:
+                raise ConfigError(
+                    f"robots.mavlink names: {system!r} is not a MAVLink system id", remedy="use 1 to 255 as keys"
+                )
+            _check_robot_name(name)
+        if self.prefix:
+            _check_robot_name(f"{self.prefix}{MAX_SYSTEM}")
+
+
+class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the robots room; times in seconds."""
+
+    mavlink: tuple[MavlinkLink, ...] = ()
+    """None: this gateway has no MAVLink vehicles of its own."""
+    system_id: int = 245
+    """Of the gateway as a MAVLink system; ground stations use 255 downward, vehicles 1 upward."""
+    component_id: int = 191
+    """MAV_COMP_ID_ONBOARD_COMPUTER: autopilots leave commands to it alone."""
+    heartbeat_s: float = 1.0
+    heartbeat_lost_s: float = 3.0
+    """Three missed heartbeats: what ground stations call lost."""
+    state_hz: float = 5.0
+    """Most RobotInfo per second and vehicle, beside changes of mode, arming and connection."""
+    ack_timeout_s: float = 0.7
+    """Before a command or mission message is sent again; radio links answer within 0.5 s."""
+    tries: int = 8
+    """At 20 % loss each way one exchange fails with 0.36; eight in a row with 0.0003."""
+    takeoff_altitude_m: float = 10.0
+    """Where a flight begins when no altitude is given."""
+    arrival_m: float = 1.5
+    """Nearer than this to the last waypoint is there: GPS is no better."""
+    stall_s: float = 45.0
+    """A movement that has not come nearer to its end for so long has failed."""
+    ledger: int = 1000
+    """Command ids remembered per robot."""
+    max_vehicles: int = 32
+    """Per link; heartbeats of further systems are refused."""
+
+    def check(self) -> None:
+        """Raise ConfigError for values that cannot work together."""
+        addresses: set[tuple[str, int]] = set()
+        for link in self.mavlink:
+            link.check()
+            if link.address() in addresses:
+                raise ConfigError(f"robots.mavlink: {link.listen} is given twice", remedy="one link per UDP port")
+            addresses.add(link.address())
+        if not 1 <= self.system_id <= MAX_SYSTEM:
+            raise ConfigError(f"robots.system_id {self.system_id} is not a MAVLink system id", remedy="use 1 to 255")
+
+
+def udp_address(url: str) -> tuple[str, int]:
+    """Split `udp://host:port`; ConfigError with the remedy for anything else."""
+    parts = urlsplit(url)
+    try:
+        port = parts.port
+    except ValueError:
+        port = None
+    if parts.scheme != "udp" or not parts.hostname or port is None or parts.path not in ("", "/"):
+        raise ConfigError(f"MAVLink address {url!r} is not understood", remedy="write udp://host:port")
+    return parts.hostname, port
+
+
+def _check_robot_name(name: str) -> None:
+    try:
+        check_name(name, "robot")
+    except PayloadError as error:
+        raise ConfigError(f"robots.mavlink: {error.message}", remedy=error.remedy) from error
