@@ -13,6 +13,7 @@ it makes in its bind-mounted folder belong to the service user (rootless: root i
 """
 
 import asyncio
+import json
 import os
 import threading
 from collections.abc import Callable, Mapping
@@ -28,6 +29,18 @@ from podman.errors import APIError, ImageNotFound, NotFound, PodmanError
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 
 T = TypeVar("T")
+RUNC_REMEDY = (
+    'crun wants cgroup v2: put runtime = "runc" under [engine] in ~/.config/containers/containers.conf of the'
+    " service user and restart podman.socket"
+)
+"""Podman before 4.4 takes the OCI runtime from its own configuration only, whatever a request asks for."""
+# Labels of containers and volumes.
+LABEL_FLEET = "swiftbot.fleet"
+LABEL_GATEWAY = "swiftbot.gateway"
+LABEL_IMAGE = "swiftbot.image"
+LABEL_ID = "swiftbot.id"
+LABEL_STATE = "swiftbot.made"
+"""Hash of all that is fixed when a container is made: image, runner, handlers, size. Adopted only if it is the same."""
 LIMITING = frozenset({"memory", "pids", "cpu"})
 """cgroup controllers that must be delegated for limits to hold."""
 
@@ -82,7 +95,7 @@ class FoundImage(Struct, frozen=True, kw_only=True):
 
     id: str
     tags: tuple[str, ...]
-    size_mb: float
+    size_bytes: int
     created: str
 
 
@@ -221,7 +234,12 @@ class PodmanEngine:
         def work(client: Any) -> None:
             client.api.post(f"/containers/{container}/start").raise_for_status()
 
-        await self._ask(f"start {container[:12]}", work)
+        try:
+            await self._ask(f"start {container[:12]}", work)
+        except PoolError as error:
+            if "cgroups in hybrid mode" not in error.message:
+                raise
+            raise PoolError(error.message, remedy=RUNC_REMEDY) from error
 
     async def remove(self, container: str) -> None:
         """Kill and remove a container: `remove(force=True)` alone waits 10 s for one that ignores SIGTERM."""
@@ -229,7 +247,7 @@ class PodmanEngine:
         def work(client: Any) -> None:
             # 404: gone already; 409: not running.
             client.api.post(f"/containers/{container}/kill", params={"signal": "KILL"})
-            response = client.api.delete(f"/containers/{container}", params={"force": True, "v": False, "timeout": 0})
+            response = client.api.delete(f"/containers/{container}", params={"force": "true", "timeout": "0"})
             if response.status_code != requests.codes.not_found:
                 response.raise_for_status()
 
@@ -250,11 +268,11 @@ class PodmanEngine:
 
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return the containers, running or not, that have all these labels."""
-        wanted = [f"{key}={value}" for key, value in labels.items()]
+        wanted = _filters(labels)
 
         def work(client: Any) -> list[Found]:
             # Through the API itself: containers.list() inspects each one again.
-            response = client.api.get("/containers/json", params={"all": True, "filters": {"label": wanted}})
+            response = client.api.get("/containers/json", params={"all": "true", "filters": wanted})
             response.raise_for_status()
             return [
                 Found(
@@ -278,7 +296,7 @@ class PodmanEngine:
                 FoundImage(
                     id=str(each["Id"])[:12],
                     tags=tuple(each.get("RepoTags") or ()),
-                    size_mb=round(each.get("Size", 0) / 2**20, 1),
+                    size_bytes=int(each.get("Size", 0)),
                     created=str(each.get("Created", "")),
                 )
                 for each in response.json()
@@ -319,10 +337,10 @@ class PodmanEngine:
 
     async def remove_volumes(self, labels: Mapping[str, str]) -> None:
         """Remove the named volumes that have all these labels and that no container uses."""
-        wanted = [f"{key}={value}" for key, value in labels.items()]
+        wanted = _filters(labels)
 
         def work(client: Any) -> None:
-            response = client.api.get("/volumes/json", params={"filters": {"label": wanted}})
+            response = client.api.get("/volumes/json", params={"filters": wanted})
             response.raise_for_status()
             for each in response.json() or ():
                 client.api.delete(f"/volumes/{each['Name']}")
@@ -335,6 +353,26 @@ class PodmanEngine:
         for client in self._clients:
             client.close()
         self._clients.clear()
+
+
+def _filters(labels: Mapping[str, str]) -> str:
+    return json.dumps({"label": [f"{key}={value}" for key, value in labels.items()]})
+
+
+async def remove_fleet(fleet: str, *, url: str = "") -> int:
+    """Remove all containers and volumes of one fleet on this machine; returns how many containers.
+
+    Raises:
+        UnreachableError: Podman does not answer.
+    """
+    engine = PodmanEngine(url)
+    try:
+        found = await engine.containers({LABEL_FLEET: fleet})
+        await asyncio.gather(*(engine.remove(each.id) for each in found))
+        await engine.remove_volumes({LABEL_FLEET: fleet})
+    finally:
+        engine.close()
+    return len(found)
 
 
 def create_arguments(spec: ContainerSpec) -> dict[str, Any]:

@@ -34,14 +34,13 @@ BUILD_TIMEOUT_S = 900.0
 Progress = Callable[[str], None]
 
 
-class BuiltImage(Struct, frozen=True, kw_only=True):
-    """An image of the catalogue as it stands on this machine. `seconds` is 0 when it was there already."""
+class ImageState(Struct, frozen=True, kw_only=True):
+    """An image of the catalogue as it stands on this machine."""
 
     name: str
     reference: str
     present: bool
-    size_mb: float = 0.0
-    seconds: float = 0.0
+    size_bytes: int = 0
 
 
 def base_image(config: PoolConfig) -> str:
@@ -66,19 +65,24 @@ def _spec(name: str, catalogue: Catalogue) -> ImageSpec:
     return spec
 
 
-async def list_images(catalogue: Catalogue, config: PoolConfig) -> list[BuiltImage]:
+async def _sizes(engine: PodmanEngine) -> dict[str, int]:
+    return {tag: each.size_bytes for each in await engine.images() for tag in each.tags}
+
+
+async def list_images(catalogue: Catalogue, config: PoolConfig | None = None) -> list[ImageState]:
     """Return every image of the catalogue and whether it is there.
 
     Raises:
         UnreachableError: Podman does not answer.
     """
+    config = config or PoolConfig()
     engine = PodmanEngine(config.podman_url, threads=1)
     try:
-        sizes = {tag: each.size_mb for each in await engine.images() for tag in each.tags}
+        sizes = await _sizes(engine)
     finally:
         engine.close()
     return [
-        BuiltImage(name=name, reference=full, present=full in sizes, size_mb=sizes.get(full, 0.0))
+        ImageState(name=name, reference=full, present=full in sizes, size_bytes=sizes.get(full, 0))
         for name, spec in catalogue.images.items()
         for full in (reference(spec, config),)
     ]
@@ -89,9 +93,14 @@ def _ignore(line: str) -> None:
 
 
 async def build(
-    name: str, catalogue: Catalogue, config: PoolConfig, *, progress: Progress = _ignore, force: bool = False
-) -> BuiltImage:
-    """Build one image unless it is there.
+    name: str,
+    catalogue: Catalogue,
+    config: PoolConfig | None = None,
+    *,
+    progress: Progress = _ignore,
+    force: bool = False,
+) -> str:
+    """Build one image unless it is there; returns its reference.
 
     Args:
         name: image of the catalogue.
@@ -105,33 +114,28 @@ async def build(
         PrerequisiteError: it cannot be built; the message ends with the end of the log.
         UnreachableError: Podman does not answer.
     """
+    config = config or PoolConfig()
     spec = _spec(name, catalogue)
     full = reference(spec, config)
     begun = time.monotonic()
     engine = PodmanEngine(config.podman_url, threads=1)
     try:
-        sizes = {tag: each.size_mb for each in await engine.images() for tag in each.tags}
-        if full in sizes and not force:
+        if full in await _sizes(engine) and not force:
             progress(f"{full} is there")
-            return BuiltImage(name=name, reference=full, present=True, size_mb=sizes[full])
+            return full
         progress(f"building {full}")
         base = base_image(config)
         if base:
             await _from_registry(spec, full, base, progress)
         else:
             await _from_packages(spec, full, engine, progress)
-        sizes = {tag: each.size_mb for each in await engine.images() for tag in each.tags}
+        sizes = await _sizes(engine)
     finally:
         engine.close()
-    built = BuiltImage(
-        name=name,
-        reference=full,
-        present=full in sizes,
-        size_mb=sizes.get(full, 0.0),
-        seconds=round(time.monotonic() - begun, 1),
-    )
-    progress(f"{full}: {built.size_mb:.0f} MB in {built.seconds:.0f} s")
-    return built
+    if full not in sizes:
+        raise PrerequisiteError(f"{full} was built but is not there", remedy="see what removes images of this user")
+    progress(f"{full}: {sizes[full] / 2**20:.0f} MiB in {time.monotonic() - begun:.0f} s")
+    return full
 
 
 async def _run(what: str, command: Sequence[str], progress: Progress, *, remedy: str) -> None:

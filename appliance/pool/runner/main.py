@@ -269,7 +269,6 @@ class Zygote:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
         os.close(pipe[1])
         run.output = pipe[0]
-        os.set_blocking(run.output, False)
         # From here the child reads it; the zygote only wants to know when the other side hangs up.
         self._epoll.modify(peer, select.EPOLLRDHUP)
         self._run = run
@@ -324,7 +323,7 @@ class Zygote:
         else:
             text = f"ended by itself with status {code} and no result"
         left = b""
-        with contextlib.suppress(OSError):
+        if select.select([run.output], [], [], 0)[0]:  # what it wrote last and its own thread no longer passed on
             left = os.read(run.output, 4096)
         trace = left.decode("utf-8", "replace").strip().splitlines()[-8:]
         return {

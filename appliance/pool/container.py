@@ -1,0 +1,220 @@
+"""One pooled container as the gateway holds it: its facts, its two connections, and what can be asked of it.
+
+Two connections to the runner's socket are kept: one for control (ping, cancel; its end of file is the
+container's death) and one spare that the next run is sent on, so that a start is one message and one fork.
+None of it needs Podman's API, so warm containers serve on while Podman is away.
+"""
+
+import asyncio
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import structlog
+
+from appliance.errors import DeadlineError, PayloadError, PoolError, UnreachableError
+from appliance.model import ContainerInfo, ContainerState
+from appliance.pool.runner.frames import Decoder, FrameError, encode
+
+log = structlog.get_logger(__name__)
+
+SOCKET = "runner.sock"
+CONTROL_TIMEOUT_S = 2.0
+Frame = dict[str, Any]
+
+
+class Connection:
+    """A connection to a runner: whole frames in and out."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._decoder = Decoder()
+
+    @classmethod
+    async def open(cls, folder: Path) -> "Connection":
+        """Connect to the runner whose socket is in `folder`.
+
+        The path goes through /proc/self/fd, so that a long folder name never meets the 108 bytes that a socket's
+        address may have.
+
+        Raises:
+            OSError: there is no socket, or nobody listens.
+        """
+        handle = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+        try:
+            reader, writer = await asyncio.open_unix_connection(f"/proc/self/fd/{handle}/{SOCKET}", limit=2**20)
+        finally:
+            os.close(handle)
+        return cls(reader, writer)
+
+    async def send(self, frame: Frame) -> None:
+        """Send one frame; OSError when the other side is gone, PayloadError when it is too long."""
+        try:
+            data = encode(frame)
+        except (FrameError, TypeError, ValueError) as error:
+            raise PayloadError(f"cannot be sent to the runner: {error}") from error
+        self._writer.write(data)
+        await self._writer.drain()
+
+    async def receive(self) -> Frame | None:
+        """Return the next frame, or None at the end of file between frames.
+
+        Raises:
+            PayloadError: it is no frame, or the connection ended within one.
+        """
+        while True:
+            try:
+                frame = self._decoder.next()
+            except FrameError as error:
+                raise PayloadError(f"the runner sent garbage: {error}") from error
+            if frame is not None:
+                return frame
+            try:
+                data = await self._reader.read(2**18)
+            except OSError:
+                data = b""
+            if not data:
+                if self._decoder.pending:
+                    raise PayloadError("the run was cut off within a message")
+                return None
+            self._decoder.feed(data)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._writer.close()
+
+
+class PooledContainer:
+    """A container of the pool. The pool alone changes its `info`; reservation and times are the pool's notes."""
+
+    def __init__(self, info: ContainerInfo, folder: Path, *, on_death: Callable[["PooledContainer"], None]) -> None:
+        self.info = info
+        self.folder = folder
+        self.engine_id = ""
+        self.reservation = ""
+        self.lease_until = 0.0
+        self.idle_since = time.monotonic()
+        self.next_probe = 0.0
+        self.missed_probes = 0
+        self.clock = 0.0
+        self.rss_mb = 0.0
+        self.first_rss_mb = 0.0
+        self.problems: dict[str, str] = {}
+        self._on_death = on_death
+        self._control: Connection | None = None
+        self._spare: Connection | None = None
+        self._replies: asyncio.Queue[Frame] = asyncio.Queue(maxsize=16)
+        self._asking = asyncio.Lock()
+        self._watcher: asyncio.Task[None] | None = None
+
+    @property
+    def id(self) -> str:
+        """Its short id."""
+        return self.info.id
+
+    def become(self, state: ContainerState, *, run: str = "") -> None:
+        """Change its state."""
+        self.info = msgspec.structs.replace(self.info, state=state, run=run)
+
+    async def connect(self, *, timeout_s: float, alive: Callable[[], Any]) -> None:
+        """Wait for the runner and open both connections; `alive` is awaited now and then and raises if it ended.
+
+        Raises:
+            PoolError: the runner did not answer in time.
+        """
+        until = time.monotonic() + timeout_s
+        next_look = time.monotonic() + 1.0
+        while True:
+            try:
+                self._control = await Connection.open(self.folder)
+                break
+            except OSError as error:
+                now = time.monotonic()
+                if now > until:
+                    raise PoolError(f"the runner of {self.id} did not answer within {timeout_s:g} s") from error
+                if now > next_look:
+                    next_look = now + 1.0
+                    await alive()
+            await asyncio.sleep(0.005)
+        self._watcher = asyncio.create_task(self._watch(self._control), name=f"watch {self.id}")
+        await self.ping(timeout_s=max(0.5, until - time.monotonic()))
+        await self.refill()
+
+    async def _watch(self, control: Connection) -> None:
+        try:
+            while (frame := await control.receive()) is not None:
+                with contextlib.suppress(asyncio.QueueFull):  # nobody asked for so many
+                    self._replies.put_nowait(frame)
+        except PayloadError as error:
+            log.warning("runner broke its protocol", container=self.id, reason=error.message)
+        self._on_death(self)
+
+    async def _ask(self, frame: Frame, timeout_s: float) -> Frame:
+        control = self._control
+        if control is None:
+            raise UnreachableError(f"container {self.id} is not connected")
+        async with self._asking:
+            while not self._replies.empty():
+                self._replies.get_nowait()
+            try:
+                async with asyncio.timeout(timeout_s):
+                    await control.send(frame)
+                    return await self._replies.get()
+            except TimeoutError as error:
+                raise DeadlineError(f"the runner of {self.id} did not answer within {timeout_s:g} s") from error
+            except OSError as error:
+                raise UnreachableError(f"the runner of {self.id} is gone") from error
+
+    async def ping(self, *, timeout_s: float) -> Frame:
+        """Ask how the runner is: its run, how many it has had, its memory, what it could not import.
+
+        Raises:
+            DeadlineError, UnreachableError: it does not answer.
+        """
+        reply = await self._ask({"op": "ping"}, timeout_s)
+        problems: Any = reply.get("problems") or {}
+        self.problems = {str(key): str(value) for key, value in problems.items()} if isinstance(problems, dict) else {}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        self.rss_mb = float(reply.get("rss_mb", 0.0))
+        self.first_rss_mb = self.first_rss_mb or self.rss_mb
+        return reply
+
+    async def cancel(self, run_id: str, *, reason: str, grace_s: float) -> bool:
+        """Ask the runner to end a run; False when it has none of that id."""
+        reply = await self._ask(
+            {"op": "cancel", "run": run_id, "reason": reason, "grace_s": grace_s}, CONTROL_TIMEOUT_S
+        )
+        return bool(reply.get("ok"))
+
+    async def begin(self, order: Frame) -> Connection:
+        """Send a run on the spare connection and return it; UnreachableError when the runner is gone."""
+        connection, self._spare = self._spare, None
+        try:
+            if connection is None:
+                connection = await Connection.open(self.folder)
+            await connection.send(order)
+        except OSError as error:
+            raise UnreachableError(f"the runner of {self.id} is gone") from error
+        return connection
+
+    async def refill(self) -> None:
+        """Open the spare connection unless it is there; UnreachableError when the runner is gone."""
+        if self._spare is None:
+            try:
+                self._spare = await Connection.open(self.folder)
+            except OSError as error:
+                raise UnreachableError(f"the runner of {self.id} is gone") from error
+
+    def close(self) -> None:
+        """Hang up; a run in progress is ended by its runner."""
+        self._on_death = lambda _: None
+        if self._watcher is not None:
+            self._watcher.cancel()
+        for connection in (self._control, self._spare):
+            if connection is not None:
+                connection.close()
+        self._control = self._spare = None

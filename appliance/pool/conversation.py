@@ -1,0 +1,219 @@
+"""One run as the gateway sees it: the runner's frames become events, the handler's calls are carried out.
+
+It exists apart from the pool because it knows nothing of containers: a connection in, the final event out.
+"""
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, PayloadError, PoolError, RobotError, SwiftbotError, UnreachableError
+from appliance.model import Failure, Phase, RunEvent, RunEventKind, RunRequest
+from appliance.pool.container import Connection, Frame
+
+log = structlog.get_logger(__name__)
+
+PROGRESS_INTERVAL_S = 0.05
+"""A handler may tell its progress as often as it likes; more than 20 a second is passed on to nobody."""
+MAX_LINES = 2000
+"""Log lines of one run that are passed on."""
+MAX_CALLS = 8
+"""Calls of one run in progress at once: a handler's threads may each make one."""
+_TRANSIENT = (UnreachableError, DeadlineError, RobotError, PoolError)
+
+
+class Call(Struct, frozen=True, kw_only=True):
+    """What a handler asks of the appliance; `number` counts its calls from 1, the same in every attempt.
+
+    `name` and `args`: `command` {verb, timeout_s, args}; `notify` {to, text}; `put_artifact` {name, data: bytes,
+    media_type}; `get_artifact` {ref}. Answers may hold bytes anywhere.
+    """
+
+    run: RunRequest
+    number: int
+    name: str
+    args: dict[str, Any]
+
+
+def order(request: RunRequest, site: dict[str, Any]) -> Frame:
+    """Return the frame that starts a run."""
+    return {
+        "op": "run",
+        "run": request.run_id,
+        "skill": request.skill,
+        "robot": request.robot,
+        "params": request.params,
+        "inputs": request.inputs,
+        "attempt": request.attempt,
+        "site": site,
+        "timeout_s": request.deadline_s,
+        "memory_mb": request.need.memory_mb,
+    }
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _table(value: Any) -> dict[str, Any]:
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else {}
+
+
+class Conversation:
+    """Listens to one run to its end."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        request: RunRequest,
+        *,
+        gateway: str,
+        container: str,
+        phase: Phase,
+        entered_ns: int,
+        on_event: Callable[[RunEvent], None],
+        on_call: Callable[[Call], Awaitable[dict[str, Any]]],
+        refused: Counter[str],
+    ) -> None:
+        self._connection = connection
+        self._request = request
+        self._where = {"gateway": gateway, "container": container, "phase": phase}
+        self._entered_ns = entered_ns
+        self._started_ns = 0
+        self._on_event = on_event
+        self._on_call = on_call
+        self._refused = refused
+        self._calls: set[asyncio.Task[None]] = set()
+        self._lines = 0
+        self._told_progress = 0.0
+
+    def event(self, kind: RunEventKind, **more: Any) -> RunEvent:
+        """Return an event of this run."""
+        request = self._request
+        return RunEvent(
+            task=request.task, subtask=request.subtask, attempt=request.attempt, kind=kind, **self._where, **more
+        )
+
+    def failed(self, code: str, message: str, *, remedy: str = "", retryable: bool = True) -> RunEvent:
+        """Return the final event of a run that did not work."""
+        failure = Failure(code=code, message=message, remedy=remedy, retryable=retryable)
+        return self.event(RunEventKind.FAILED, failure=failure, duration_ms=self._duration_ms())
+
+    def _duration_ms(self) -> float | None:
+        return (time.monotonic_ns() - self._started_ns) / 1e6 if self._started_ns else None
+
+    async def listen(self) -> RunEvent:
+        """Pass on what the run tells until it ends; returns its final event, which is not passed on."""
+        try:
+            while (frame := await self._connection.receive()) is not None:
+                final = await self._take(frame)
+                if final is not None:
+                    return final
+        except PayloadError as error:
+            self._refused["runner frame"] += 1
+            return self.failed(error.code, error.message)
+        finally:
+            for call in self._calls:
+                call.cancel()
+        return self.failed("pool", "the container died in mid-run")
+
+    async def gone(self) -> None:
+        """Wait until the runner has swept up, which it tells by hanging up."""
+        while await self._connection.receive() is not None:
+            pass
+
+    async def _take(self, frame: Frame) -> RunEvent | None:
+        match frame.get("ev"):
+            case "started":
+                self._started_ns = int(_number(frame.get("at"))) or time.monotonic_ns()
+                startup_ms = (self._started_ns - self._entered_ns) / 1e6
+                self._on_event(self.event(RunEventKind.STARTED, startup_ms=startup_ms))
+            case "progress":
+                self._progress(frame)
+            case "log":
+                self._line(frame)
+            case "partial":
+                self._on_event(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
+            case "checkpoint":
+                data = _table(frame.get("data"))
+                self._on_event(self.event(RunEventKind.PARTIAL, result=data, note="checkpoint"))
+            case "call":
+                await self._call(frame)
+            case "result":
+                result = _table(frame.get("result"))
+                return self.event(RunEventKind.SUCCEEDED, result=result, progress=1.0, duration_ms=self._duration_ms())
+            case "error":
+                return self._error(frame)
+            case other:
+                raise PayloadError(f"the runner sent an unknown event {str(other)[:40]!r}")
+        return None
+
+    def _progress(self, frame: Frame) -> None:
+        now = time.monotonic()
+        fraction = _number(frame.get("fraction"))
+        if now - self._told_progress >= PROGRESS_INTERVAL_S or fraction >= 1.0:
+            self._told_progress = now
+            note = str(frame.get("note", ""))
+            self._on_event(self.event(RunEventKind.PROGRESS, progress=fraction, note=note))
+
+    def _line(self, frame: Frame) -> None:
+        self._lines += 1
+        if self._lines > MAX_LINES:
+            self._refused["run output"] += 1
+            return
+        fields = _table(frame.get("fields"))
+        self._on_event(self.event(RunEventKind.LOG, note=str(frame.get("text", "")), result=fields or None))
+
+    def _error(self, frame: Frame) -> RunEvent:
+        trace = frame.get("trace")
+        for line in cast("list[object]", trace) if isinstance(trace, list) else ():
+            self._line({"text": str(line)})
+        return self.failed(
+            str(frame.get("code", "internal")),
+            str(frame.get("message", "")),
+            remedy=str(frame.get("remedy", "")),
+            retryable=bool(frame.get("retryable", False)),
+        )
+
+    async def _call(self, frame: Frame) -> None:
+        number = int(_number(frame.get("n")))
+        if len(self._calls) >= MAX_CALLS:
+            self._refused["call"] += 1
+            error = {"code": "refused", "message": f"{MAX_CALLS} calls are in progress already", "retryable": True}
+            await self._reply({"n": number, "error": error})
+            return
+        call = Call(run=self._request, number=number, name=str(frame.get("name", "")), args=_table(frame.get("args")))
+        task = asyncio.create_task(self._carry_out(call), name=f"call {self._request.run_id}/{number}")
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+
+    async def _carry_out(self, call: Call) -> None:
+        reply: Frame
+        try:
+            reply = {"n": call.number, "ok": await self._on_call(call)}
+        except SwiftbotError as error:
+            reply = self._refusal(call.number, error, retryable=isinstance(error, _TRANSIENT))
+        except Exception as error:  # noqa: BLE001 - supervision boundary: a handler must get an answer, whatever broke
+            log.exception("call broke", run=call.run.run_id, call=call.name)
+            reply = self._refusal(call.number, SwiftbotError(f"{type(error).__name__}: {error}"), retryable=True)
+        try:
+            await self._reply(reply)
+        except PayloadError as error:
+            self._refused["call"] += 1
+            await self._reply(self._refusal(call.number, error, retryable=False))
+
+    @staticmethod
+    def _refusal(number: int, error: SwiftbotError, *, retryable: bool) -> Frame:
+        told = {"code": error.code, "message": error.message, "remedy": error.remedy, "retryable": retryable}
+        return {"n": number, "error": told}
+
+    async def _reply(self, frame: Frame) -> None:
+        try:
+            await self._connection.send(frame)
+        except OSError:
+            log.info("run ended before its answer came", run=self._request.run_id)

@@ -1,0 +1,287 @@
+"""Makes, adopts and removes this gateway's containers: what a container of an image is, in one place.
+
+It exists apart from the pool so that policy (when, how many, whom to give up) and mechanism (labels, mounts,
+waiting for the runner) can be read each on its own.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import secrets
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import structlog
+from msgspec import Struct
+from msgspec.structs import replace
+
+from appliance.errors import PoolError, SwiftbotError
+from appliance.model import ContainerInfo, ContainerState, Need
+from appliance.pool import images
+from appliance.pool.container import PooledContainer
+from appliance.pool.engine import (
+    LABEL_FLEET,
+    LABEL_GATEWAY,
+    LABEL_ID,
+    LABEL_IMAGE,
+    LABEL_STATE,
+    ContainerSpec,
+    Engine,
+    EngineFacts,
+    Found,
+)
+from appliance.pool.settings import PoolConfig
+from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
+
+log = structlog.get_logger(__name__)
+
+RUNNER = Path(__file__).resolve().parent / "runner"
+ADOPT_TIMEOUT_S = 2.0
+LABEL_SIZE = "swiftbot.size"
+
+
+class Size(Struct, frozen=True, kw_only=True):
+    """What a container is given."""
+
+    cpu: float
+    memory_mb: int
+    volumes: tuple[str, ...]
+
+
+class Starter:
+    """Makes containers for one gateway of one fleet, and takes over those it finds."""
+
+    def __init__(
+        self,
+        config: PoolConfig,
+        *,
+        gateway: str,
+        fleet: str,
+        run_dir: Path,
+        catalogue: Catalogue,
+        on_death: Callable[[PooledContainer], None],
+    ) -> None:
+        self._config = config
+        self._gateway = gateway
+        self._fleet = fleet
+        self._run_dir = run_dir
+        self._catalogue = catalogue
+        self._on_death = on_death
+        self._labels = {LABEL_FLEET: fleet, LABEL_GATEWAY: gateway}
+        self._code = code_digest(catalogue)
+
+    def skills(self, image: str) -> list[SkillManifest]:
+        """Return the skills that a container of an image can run: its own and those of compatible images."""
+        served = {image, *self._catalogue.images[image].compatible}
+        return [each for each in self._catalogue.skills.values() if each.implemented and each.image in served]
+
+    def size(self, image: str, need: Need | None = None) -> Size:
+        """Return what a container of an image gets: enough for each of its skills, and for `need`."""
+        own = [each for each in self._catalogue.skills.values() if each.image == image]
+        cpus = [self._config.cpu, *(each.cpu for each in own), *([need.cpu] if need else [])]
+        memories = [
+            self._config.container_memory_mb,
+            *(each.memory_mb for each in own),
+            *([need.memory_mb] if need else []),
+        ]
+        volumes = {name for each in own for name in each.volumes} | set(need.volumes if need else ())
+        return Size(cpu=max(cpus), memory_mb=max(memories), volumes=tuple(sorted(volumes)))
+
+    def new(self, image: str, need: Need | None = None) -> PooledContainer:
+        """Return a container that is yet to be started."""
+        size = self.size(image, need)
+        name = secrets.token_hex(6)
+        info = ContainerInfo(
+            id=name,
+            gateway=self._gateway,
+            image=image,
+            state=ContainerState.STARTING,
+            cpu=size.cpu,
+            memory_mb=size.memory_mb,
+            volumes=size.volumes,
+            compatible=self._catalogue.images[image].compatible,
+            since_ns=time.time_ns(),
+        )
+        return PooledContainer(info, self._run_dir / name, on_death=self._on_death)
+
+    async def start(self, container: PooledContainer, engine: Engine, facts: EngineFacts) -> None:
+        """Create and start it and wait for its runner; what is left of a failed one is removed.
+
+        Raises:
+            PoolError, PrerequisiteError, UnreachableError: it could not be started, with the reason.
+        """
+        began = time.monotonic()
+        spec = self._spec(container, facts)
+        await asyncio.to_thread(container.folder.mkdir, mode=0o700, parents=True)
+        try:
+            for volume in spec.volumes:
+                await engine.ensure_volume(volume, self._labels)
+            container.engine_id = await engine.create(spec)
+            await engine.start(container.engine_id)
+
+            async def alive() -> None:
+                found = await engine.containers({**self._labels, LABEL_ID: container.id})
+                if not any(each.running for each in found):
+                    raise PoolError(f"container {container.id} of {container.info.image} ended at once")
+
+            await container.connect(timeout_s=self._config.start_timeout_s, alive=alive)
+        except BaseException as error:
+            text = await engine.logs(container.engine_id) if container.engine_id else ""
+            await self._discard(container, engine)
+            if text and isinstance(error, SwiftbotError):
+                raise PoolError(f"{error.message}; it wrote: {text[-600:]}", remedy=error.remedy) from error
+            raise
+        cold_ms = (time.monotonic() - began) * 1e3
+        container.info = replace(container.info, cold_ms=cold_ms)
+        for what, problem in container.problems.items():
+            log.warning("not preloaded", container=container.id, image=container.info.image, what=what, reason=problem)
+
+    async def _discard(self, container: PooledContainer, engine: Engine) -> None:
+        with contextlib.suppress(SwiftbotError):
+            await self.remove(container, engine)
+
+    async def remove(self, container: PooledContainer, engine: Engine | None) -> None:
+        """End a container and remove all that is its own; SwiftbotError when Podman will not or is away."""
+        container.close()
+        if engine is not None and container.engine_id:
+            await engine.remove(container.engine_id)
+        await asyncio.to_thread(shutil.rmtree, container.folder, ignore_errors=True)
+
+    async def own(self, engine: Engine) -> list[str]:
+        """Return Podman's ids of this gateway's containers."""
+        return [each.id for each in await engine.containers(self._labels)]
+
+    async def adopt(self, engine: Engine) -> list[PooledContainer]:
+        """Take over this gateway's running containers that are as they would be made now; remove the others.
+
+        Raises:
+            SwiftbotError: Podman does not tell what there is.
+        """
+        found = await engine.containers(self._labels)
+        adopted = [each for each in await asyncio.gather(*(self._adopt(each, engine) for each in found)) if each]
+        await asyncio.to_thread(self._forget_folders, {each.id for each in adopted})
+        return adopted
+
+    async def _adopt(self, found: Found, engine: Engine) -> PooledContainer | None:
+        name, image = found.labels.get(LABEL_ID, ""), found.labels.get(LABEL_IMAGE, "")
+        reason = ""
+        container: PooledContainer | None = None
+        if not found.running:
+            reason = "not running"
+        elif not name or image not in self._catalogue.images:
+            reason = "not of this catalogue"
+        else:
+            container = self.new(image)
+            container.folder = self._run_dir / Path(name).name
+            container.engine_id = found.id
+            size = json.loads(found.labels.get(LABEL_SIZE, "{}"))
+            container.info = replace(
+                container.info,
+                id=name,
+                cpu=float(size.get("cpu", container.info.cpu)),
+                memory_mb=int(size.get("memory_mb", container.info.memory_mb)),
+                volumes=tuple(str(each) for each in size.get("volumes", ())),
+            )
+            if found.labels.get(LABEL_STATE) != self._made(image):
+                reason = "made of another image, runner or handlers"
+            else:
+                reason = await self._take_over(container)
+        if not reason:
+            return container
+        log.info("not adopted", container=name or found.name, reason=reason)
+        if container is not None:
+            container.close()
+        with contextlib.suppress(SwiftbotError):
+            await engine.remove(found.id)
+        return None
+
+    async def _take_over(self, container: PooledContainer) -> str:
+        """Connect to a container that runs; returns why it cannot be had, empty when it can."""
+
+        async def alive() -> None:
+            """Not asked: Podman has just said so."""
+
+        until = time.monotonic() + self._config.cancel_grace_s + ADOPT_TIMEOUT_S
+        try:
+            await container.connect(timeout_s=ADOPT_TIMEOUT_S, alive=alive)
+            # The run of the gateway before us is being ended by the runner, which has seen it hang up.
+            while reply := (await container.ping(timeout_s=ADOPT_TIMEOUT_S)).get("run"):
+                if time.monotonic() > until:
+                    return f"run {reply} of the gateway before does not end"
+                await asyncio.sleep(0.05)
+        except SwiftbotError as error:
+            return error.message
+        return ""
+
+    def _forget_folders(self, known: set[str]) -> None:
+        for folder in self._run_dir.iterdir() if self._run_dir.is_dir() else ():
+            if folder.is_dir() and folder.name not in known:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _reference(self, image: str) -> str:
+        return images.reference(self._catalogue.images[image], self._config)
+
+    def _made(self, image: str) -> str:
+        config = self._config
+        parts = (self._reference(image), self._code, config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+    def _spec(self, container: PooledContainer, facts: EngineFacts) -> ContainerSpec:
+        config, info = self._config, container.info
+        image = self._catalogue.images[info.image]
+        binds = {str(container.folder): "/run/swiftbot", str(SKILLS): "/skills", str(RUNNER): "/runner"}
+        folders: dict[str, str] = {}
+        modules = list(image.preload)
+        for skill in self.skills(info.image):
+            root = skill.folder.parent
+            place = binds.setdefault(str(root), f"/skills-{len(binds)}")
+            folders[skill.id] = f"{place}/{skill.folder.name}"
+            modules += skill.preload
+        runner = {"skills": folders, "modules": list(dict.fromkeys(modules))}
+        processes = 0 if facts.limits_enforced else config.user_processes
+        command = ("python3", "-s", "-m", "runner.main", "--socket", "/run/swiftbot/runner.sock")
+        size = {"cpu": info.cpu, "memory_mb": info.memory_mb, "volumes": info.volumes}
+        labels = {
+            LABEL_ID: info.id,
+            LABEL_IMAGE: info.image,
+            LABEL_STATE: self._made(info.image),
+            LABEL_SIZE: json.dumps(size),
+        }
+        return ContainerSpec(
+            name=f"swiftbot-{self._fleet}-{self._gateway}-{info.id}",
+            image=self._reference(info.image),
+            command=(*command, "--processes", str(processes), "--spec", json.dumps(runner)),
+            labels=self._labels | labels,
+            binds=binds,
+            writable=frozenset({str(container.folder)}),
+            volumes={f"swiftbot-{self._fleet}-{self._gateway}-{name}": f"/volumes/{name}" for name in info.volumes},
+            environment={
+                "PYTHONDONTWRITEBYTECODE": "1",
+                # `runner` is below /, what handlers share (`_lib`) below /skills.
+                "PYTHONPATH": "/:/skills",
+                "LANG": "C.UTF-8",
+                # BLAS would start a thread a core in the zygote, and threads do not live through a fork.
+                "OPENBLAS_NUM_THREADS": "1",
+            },
+            cpu=info.cpu,
+            memory_mb=info.memory_mb,
+            pids=config.pids,
+            tmp_mb=config.tmp_mb,
+            runtime=config.runtime or ("runc" if facts.cgroup_version == "v1" else ""),
+            seccomp_profile=config.seccomp_profile,
+            limits=facts.limits_enforced,
+        )
+
+
+def code_digest(catalogue: Catalogue) -> str:
+    """Return a hash of all code that a zygote holds: the runner and the skills with what they share."""
+    digest = hashlib.sha256()
+    roots = sorted({RUNNER, SKILLS, *(each.folder.parent for each in catalogue.skills.values())})
+    for root in roots:
+        for file in sorted(root.rglob("*")):
+            if file.suffix in (".py", ".toml") and "__pycache__" not in file.parts:
+                digest.update(f"{file}\0".encode() + file.read_bytes())
+    return digest.hexdigest()
