@@ -217,6 +217,18 @@ configure_storage() {
   rm -f "$LOG.conf"
 }
 
+# Podman before 4.4 takes its OCI runtime from here only; crun, its default, refuses cgroup v1 in hybrid mode.
+configure_runtime() {
+  local file=$USER_HOME/.config/containers/containers.conf
+  [ -e "$file" ] && return
+  [ "$(stat -f -c %T /sys/fs/cgroup 2>/dev/null)" = cgroup2fs ] && return
+  say "podman: runc, since this machine has no cgroup v2"
+  printf '[engine]\nruntime = "runc"\n' >"$LOG.conf"
+  chmod 0644 "$LOG.conf"
+  (cd / && as_user mkdir -p "$(dirname "$file")" && as_user cp "$LOG.conf" "$file") 2>"$LOG" || fail "writing $file" "check who owns $USER_HOME/.config"
+  rm -f "$LOG.conf"
+}
+
 copy_tree() {
   [ "$PROJECT" = "$TREE" ] && return
   local staging owner=$RUN_USER:$(id -g "$RUN_USER")
@@ -374,6 +386,7 @@ make_user
 give_ranges
 make_runtime_dir
 configure_storage
+configure_runtime
 copy_tree
 make_environment
 install_package
