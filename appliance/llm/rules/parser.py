@@ -1,0 +1,549 @@
+"""Instruction to graph: sentences, the clauses in them, and what the words between them mean for the order.
+
+Goes through the text once, left to right. Each word of it is either understood (part of a clause that fits a
+pattern, or a connective) or not; the share that was understood is the confidence. Nothing is guessed: a clause that
+fits no pattern adds no subtask and costs confidence.
+"""
+
+import re
+
+from msgspec import Struct
+
+from appliance.llm.rules import lexicon as lx
+from appliance.llm.rules import names
+from appliance.llm.rules.clauses import Clause, Reader, Who
+from appliance.llm.rules.graph import Graph, Snapshot
+from appliance.llm.rules.handling import things
+from appliance.llm.rules.phrases import Step
+from appliance.model import RobotInfo, Site, Subtask
+from appliance.skills.catalogue import Catalogue
+
+_QUOTE = re.compile(
+    r"[\"\u201c]([^\"\u201c\u201d]{1,400})[\"\u201d]|(?<![\w])['\u2018]([^'\u2018\u2019]{1,400})['\u2019](?!\w)"
+)
+_LEAD_ALL = re.compile(
+    r"(?:and )?(?:then|after that|after this|afterwards|afterward|thereafter|next|finally|lastly|subsequently|in the end|"
+    r"(?:once|when|as soon as) (?:(?:you are|you're|that is|that's|all(?: of (?:that|this|them))? (?:is|are)|everything is|it is|it's|this is) )?(?:all )?(?:done|finished|complete|ready))\b[,:]?\s*",
+    re.IGNORECASE,
+)
+_LEAD_BESIDE = re.compile(
+    r"(?:and )?(?:meanwhile|in the meantime|in the meanwhile|at the same time|simultaneously|in parallel|concurrently)\b[,:]?\s*",
+    re.IGNORECASE,
+)
+_LEAD_FIRST = re.compile(r"(?:first|firstly|first of all|to begin with|to start with)\b[,:]?\s*", re.IGNORECASE)
+_PREFIX = re.compile(
+    r"(?P<word>while|whilst|as soon as|as|before|(?:only )?(?:after|once|when|whenever|if)|in case)\s+(?P<rest>.+)",
+    re.IGNORECASE | re.DOTALL,
+)
+_BETWEEN = re.compile(
+    r"(?P<then>[,;]?\s+(?:and |but )?(?:then|after that|afterwards|after which|thereafter|next|finally|lastly|followed by)\b,?\s+)"
+    r"|(?P<beside>[,;]?\s+(?:and |but |all )?,?\s*(?:while|whilst|meanwhile|in the meantime|at the same time as|at the same time|simultaneously|in parallel|as (?=(?:you|it|he|she|they)\b))\b,?\s+(?:also )?)"
+    r"|(?P<before>,?\s+(?:but )?before\s+)"
+    r"|(?P<after>,?\s+(?:but )?(?:only )?after\s+)"
+    r"|(?P<when>,?\s+(?:and |but )?(?:only )?(?:as soon as|once|when|if)\s+)"
+    r"|(?P<list>\s*,\s*(?:and\s+|but\s+)?(?:also\s+)?|\s+and\s+(?:also\s+)?|\s+-\s+|\s*:\s+)",
+    re.IGNORECASE,
+)
+_DONE = re.compile(
+    r"(?P<who>.+?)(?:'s|'re| is| are| has| have| gets?| get| was| were)?(?: all| both)? (?:been )?"
+    r"(?:done|finished|finnished|complete|completed|there|ready|through|arrived|answered|replied|docked|airborne|landed|in position|in place|back|home|in|over|up|"
+    r"returned|it|at .+|taken off|loaded|charged|the .+ there)(?: (?:there|both|it|this|that|up))?",
+    re.IGNORECASE,
+)
+_CHECKS = frozenset(
+    {
+        "inspect",
+        "find",
+        "detect",
+        "count",
+        "ask",
+        "read",
+        "measure",
+        "scan_thermal",
+        "compare",
+        "track",
+        "wait_for",
+        "photograph",
+    }
+)
+_TRAILING = re.compile(r",\s*(?P<name>[A-Za-z][\w-]*(?: (?:\d+|[A-Z]))?)(?=\s*(?:$|,\s))")
+
+
+class Reading(Struct):
+    """What became of an instruction: the subtasks and how much of it was understood."""
+
+    subtasks: tuple[Subtask, ...]
+    confidence: float
+    lost: tuple[str, ...]
+    """Pieces that fit no pattern."""
+
+
+class Parser:
+    """Reads one instruction."""
+
+    def __init__(self, catalogue: Catalogue, *, robots: tuple[RobotInfo, ...] | None, site: Site | None) -> None:
+        roster = None if robots is None else tuple(robot.id for robot in robots)
+        self._names = names.Names(roster, tuple(robot.id for robot in robots or () if robot.flies))
+        self._quotes: list[str] = []
+        self._reader = Reader(
+            catalogue, self._names, (lambda name: site is not None and site.find(name) is not None), self._quotes
+        )
+        self._graph = Graph(catalogue)
+        self._said = 0
+        self._lost = 0.0
+        self._pieces: list[str] = []
+        self._to: list[str] = ["any"]
+        """Whom an elided subject means."""
+        self._anys = 0
+        self._last: Clause | None = None
+
+    def parse(self, instruction: str) -> Reading:
+        """Read the whole instruction."""
+        for sentence in self._sentences(instruction):
+            self._sentence(sentence)
+        subtasks = self._graph.subtasks()
+        labels = {each.robot for each in subtasks} | {
+            name for each in subtasks for name in each.params.get("robots", ())
+        }
+        if "any1" in labels and "any2" not in labels:
+            subtasks = tuple(_renamed(each, "any1", "any") for each in subtasks)
+        confidence = max(0.0, 1.0 - self._lost / self._said) if self._said and subtasks else 0.0
+        return Reading(subtasks, round(confidence, 3), tuple(self._pieces[:8]))
+
+    # --- text to sentences ----------------------------------------------------------------------------------------
+
+    def _sentences(self, text: str) -> list[str]:
+        text = text.replace("\x00", " ").replace("\u2013", "-").replace("\u2014", " - ").replace("\u2019", "'")
+
+        def keep(match: re.Match[str]) -> str:
+            said = match[1] or match[2]
+            self._quotes.append(said.strip())
+            ends = said.rstrip().endswith((".", "?", "!"))
+            follows = re.match(r"\s+[A-Z]", text[match.end() :])
+            return f"\x00{len(self._quotes) - 1}\x00" + (". " if ends and follows else "")
+
+        text = _QUOTE.sub(keep, text)
+        text = re.sub(r"[A-Za-z]+", lambda match: lx.spell(match[0]), text)
+        text = re.sub(r"(?:^|(?<=[:\n]))\s*(?:[-*\u2022]) +", ". ", text)
+        marks = re.findall(r"(?:(?<=\s)|^)\(?\d{1,2}[.)]\s", text)
+        if len(marks) > 1:
+            text = re.sub(
+                r"\s*(?:(?<=\s)|^)\(?(\d{1,2})[.)]\s+", lambda match: " " if match[1] == "1" else ", then ", text
+            )
+            text = re.sub(r"[.;]\s*, then ", ", then ", text)
+        text = re.sub(r"\b(Dr|Mr|Mrs|Ms|St|No|approx)\.", r"\1", text)
+        text = re.sub(r"(?:each|all|both|every one) of (?:the )?(?=\w+s? (?:\d+|[A-Z])\b)", "", text)
+        text = re.sub(r"\b([A-Za-z]+)s ((?:(?:\d+|[A-Z]),? )+and (?:\d+|[A-Z]))\b", _spread, text)
+        parts = re.split(r"(?<=[\w\x00)\]])[.!?;]+(?=\s|$)|\n+|^\. |\s\. ", text)
+        return [part.strip() for part in parts if part and part.strip(" .,;:!?")]
+
+    # --- one sentence ---------------------------------------------------------------------------------------------
+
+    def _sentence(self, text: str) -> None:
+        words = len(text.split())
+        self._said += words
+        beside = False
+        wait_all = False
+        for _ in range(3):
+            if match := _LEAD_ALL.match(text):
+                wait_all, text = True, text[match.end() :]
+            elif match := _LEAD_BESIDE.match(text):
+                beside, text = True, text[match.end() :]
+            elif match := _LEAD_FIRST.match(text):
+                text = text[match.end() :]
+        if not text.strip(" ,.:"):
+            return
+        start = self._graph.new_sentence(parallel=beside)
+        if wait_all:
+            self._graph.barrier |= self._graph.lasts()
+        self._last = None
+        text = self._spoken_to(text)
+        if not text.strip(" ,.:"):
+            return
+        text = self._trailing(text)
+        if (match := _PREFIX.fullmatch(text)) and self._prefixed(match["word"].lower(), match["rest"], start):
+            return
+        if self._leading_place(text, start):
+            return
+        self._clauses(text, start)
+
+    def _spoken_to(self, text: str) -> str:
+        """Take "Robot_1:", "A and B," off the front; they are spoken to until somebody else is."""
+        match = re.match(r"(?:mission|task|plan|orders|list|job) for (?P<rest>.+)", text, re.IGNORECASE | re.DOTALL)
+        body = match["rest"] if match else text
+        if match := re.match(
+            r"(?P<n>[A-Z][\w-]*(?: (?:\d+|[A-Z]))?)'s (?:list|tasks?|jobs?|orders)[^:]*:\s*(?P<rest>.+)",
+            body,
+            re.DOTALL,
+        ):
+            self._address([self._names.resolve(match["n"])])
+            return match["rest"]
+        if match := names.ALL.match(body) or names.SEVERAL.match(body):
+            rest = body[match.end() :]
+            if mark := re.match(r"(?:,? please)?\s*[:,]\s*", rest):
+                groups = match.groupdict()
+                if groups.get("n"):
+                    robots = [f"any{index + 1}" for index in range(int(lx.number(groups["n"]) or 2))]
+                else:
+                    robots = self._names.everyone(groups.get("kind") or groups.get("plural") or "")
+                self._address(robots)
+                return rest[mark.end() :]
+        found = self._names.leading(body)
+        if found:
+            robots, rest = found
+            mark = re.match(r"\s*(?::|,|\s-)\s*", rest)
+            if mark and rest[mark.end() :].strip() and (":" in mark[0] or self._follows(rest[mark.end() :])):
+                self._address(list(dict.fromkeys(robots)))
+                return re.sub(r"^(?:this is \w+[:,.]?\s*)", "", rest[mark.end() :])
+            if mark is None and rest.strip(" .") == "":
+                self._address(robots)
+                return ""
+        return text
+
+    def _follows(self, text: str) -> bool:
+        """Whether what stands after a name is said to it: it starts with a verb, or a politeness before one."""
+        text = re.sub(r"^(?:this is \w+[:,.]?\s*)", "", text)
+        if not text.strip():
+            return True
+        if (
+            _PREFIX.match(text)
+            or _LEAD_FIRST.match(text)
+            or re.match(r"(?:at|in) (?!the same)|please|what|i\b|could|can|would", text, re.IGNORECASE)
+        ):
+            return True
+        first = re.match(r"[A-Za-z']+", text)
+        return bool(first and first[0].lower() in lx.LEMMA and not re.match(r"\w+(?:es|s)\b", first[0])) or bool(
+            first and self._reader.starts(_BETWEEN.split(text)[0] or text)
+        )
+
+    def _trailing(self, text: str) -> str:
+        """Take a name off the end ("Inspect the pump, Heron") or the middle and speak to it."""
+        for match in _TRAILING.finditer(text):
+            name = match["name"]
+            sure = self._names.sure.fullmatch(name)
+            if not sure and not (
+                name[0].isupper() and name.split()[0].lower() not in names.NOT_NAMES and self._names.roster is None
+            ):
+                continue
+            without = text[: match.start()] + text[match.end() :]
+            if not sure and not self._reader.starts(text[: match.start()]):
+                continue
+            if re.search(r",\s*[A-Z]\w*|\b[A-Z]\w* and\b", text[: match.start()]) and not sure:
+                continue
+            self._address([self._names.resolve(name)])
+            return without
+        return text
+
+    def _address(self, robots: list[str]) -> None:
+        self._names.seen.update(robots)
+        self._to = robots
+        self._mention(robots)
+
+    def _mention(self, robots: list[str]) -> None:
+        mentions = self._reader.mentions
+        mentions.robots = list(robots)
+        if len(robots) > 1:
+            mentions.group = list(robots)
+        elif robots and robots[0] not in mentions.group and not robots[0].startswith("any"):
+            mentions.group = [*mentions.group[-1:], *robots] if mentions.group else list(robots)
+
+    def _prefixed(self, word: str, rest: str, start: Snapshot | None) -> bool:
+        """Read "while A, B", "before A, B", "once A, B"; False when no comma separates two clauses."""
+        word = word.removeprefix("only ")
+        for match in re.finditer(r"\s*[,:]\s*(?:then\s+)?", rest):
+            condition, main = rest[: match.start()], rest[match.end() :]
+            vocative = self._names.leading(main)
+            if not (
+                self._reader.starts(_first_chunk(main))
+                or vocative
+                or _LEAD_FIRST.match(main)
+                or re.match(r"at |in ", main)
+            ):
+                continue
+            if word in ("while", "whilst", "as"):
+                before = self._graph.snapshot() if start is None else start
+                self._clauses(condition, start)
+                self._graph.scope = set()
+                self._clauses(self._spoken_to(main), before)
+            elif word == "before":
+                old = len(self._graph.steps)
+                self._clauses(self._spoken_to(main), start)
+                self._graph.barrier |= self._graph.lasts(range(old, len(self._graph.steps)))
+                self._clauses(condition, None)
+            else:
+                self._condition(word, condition)
+                self._clauses(self._spoken_to(main), None)
+            return True
+        return False
+
+    def _condition(self, word: str, text: str) -> None:
+        """Make what follows in this sentence wait for a condition: work that is done, or an event."""
+        graph = self._graph
+        done = _DONE.fullmatch(text)
+        if graph.steps and done:
+            robot = self._names.known(done["who"]) or (
+                self._names.resolve(done["who"]) if self._names.resolve(done["who"]) in graph.tails else None
+            )
+            graph.barrier |= graph.tails[robot] if robot in graph.tails else graph.lasts()
+            return
+        old = len(graph.steps)
+        if self._reader.starts(_first_chunk(text)) and word != "if":
+            self._clauses(text, None)
+            if len(graph.steps) > old:
+                graph.barrier |= graph.lasts(range(old, len(graph.steps)))
+                return
+        checked = any(skill in _CHECKS for skill, _, _ in graph.steps)
+        if word in ("if", "in case"):
+            graph.barrier |= graph.lasts()
+            if not checked:
+                self._lose(f"{word} {text}", len(text.split()) + 1)
+        elif (
+            graph.steps
+            and checked
+            and re.match(r"(?:you|it|he|she|they|everyone|everybody|all|both)\b", text, re.IGNORECASE)
+        ):
+            graph.barrier |= graph.lasts()
+        else:
+            step = Step("wait_for", {"event": self._reader.unquote(text.strip(" ,."))})
+            _, ends = graph.add(self._to[:1] if self._to != ["all"] else ["any"], [step])
+            graph.barrier |= ends
+
+    def _leading_place(self, text: str, start: Snapshot | None) -> bool:
+        """Read "at stations 3, 5 and 8, read the barcode": the rest once at each place."""
+        match = re.match(
+            r"(?:at|in|on|inside) (?P<p>.+?), (?P<rest>(?!and )[^,]*\b.*)", text, re.IGNORECASE | re.DOTALL
+        )
+        while match and not self._reader.starts(_first_chunk(match["rest"])):
+            match = re.match(
+                rf"(?:at|in|on|inside) (?P<p>{re.escape(match['p'])}, .+?), (?P<rest>(?!and ).+)",
+                text,
+                re.IGNORECASE | re.DOTALL,
+            )
+        if match is None or self._reader.starts(match["p"]):
+            return False
+        if re.match(r"the (?:gateway|server|edge)\b", match["p"], re.IGNORECASE):
+            self._clauses(match["rest"], start)
+            return True
+        for place in things(match["p"]):
+            where = self._reader.place(place)
+            self._graph.add(self._doers(Who()), [Step("goto", {"place": where})], beside=start)
+            self._reader.mentions.place = where
+            self._clauses(match["rest"], None)
+        return True
+
+    # --- clauses and what stands between them -----------------------------------------------------------------------
+
+    def _chunks(self, text: str) -> list[tuple[str, str]]:
+        """Split a sentence into (connective, clause), where both sides of a connective are clauses."""
+        found: list[tuple[str, str]] = []
+        kind, begin, where = "list", 0, 0
+        while match := _BETWEEN.search(text, where):
+            left, right = text[begin : match.start()], text[match.end() :]
+            this = match.lastgroup or "list"
+            where = match.end()
+            if not left.strip(" ,"):
+                kind, begin = (this if this != "list" else kind), match.end()
+                continue
+            if "beside" == this and not right.strip(" ,."):
+                continue
+            if self._breaks(this, left, right):
+                found.append((kind, left))
+                kind, begin = this, match.end()
+        found.append((kind, text[begin:]))
+        return found
+
+    def _breaks(self, kind: str, left: str, right: str) -> bool:
+        head = _first_chunk(right)
+        readable = self._reader.starts(left)
+        gap = self._gapped(head, self._reader.read(left, speaking_to=self._to)) is not None if readable else False
+        if kind in ("before", "after", "when"):
+            if re.search(r"\b(?:wait|until|till|waits)\b", left) and kind != "before":
+                return False
+            return readable and (
+                self._reader.starts(head) or _DONE.fullmatch(_clean(right)) is not None or kind == "when"
+            )
+        if kind == "beside":
+            return readable or self._reader.starts(head)
+        if not readable:
+            return False
+        if self._reader.starts(head) or gap:
+            return True
+        if kind == "then" and (self._follows(right)):
+            return True
+        if kind == "list" and re.match(r"(?:once|when|after|before|while|if|as soon as)\b", right, re.IGNORECASE):
+            return True
+        match = _BETWEEN.match(right) or None
+        return match is not None and match.lastgroup != "list"
+
+    def _gapped(self, text: str, previous: Clause | None) -> Clause | None:
+        """Read "robot 3 pallet 62 at dock 5" after "robot 2 picks up pallet 61 at dock 4"."""
+        if previous is None or previous.who.kind not in ("named", "one", "first", "other", "all"):
+            return None
+        found = self._names.leading(_clean(text))
+        if found is None or len(found[0]) != 1 or not found[1].strip():
+            return None
+        rest = found[1].strip()
+        if re.match(r"(?:that|those) (?:of|from) ", rest) and (quantity := previous.steps[-1].params.get("quantity")):
+            rest = f"{quantity} {rest.split(None, 1)[1]}"
+        prefix = previous.prefix
+        for candidate in (prefix, prefix.rsplit(" ", 1)[0]):
+            clause = self._reader.read(f"{candidate} {rest}", speaking_to=found[0])
+            if clause and [step.skill for step in clause.steps] == [step.skill for step in previous.steps]:
+                clause.who = Who(found[0], "named")
+                clause.prefix = prefix
+                return clause
+        return None
+
+    def _clauses(self, text: str, start: Snapshot | None) -> None:
+        beside = start
+        sentence = self._graph.snapshot() if start is None else start
+        pending: list[set[int]] = []
+        for kind, piece in self._chunks(text):
+            if kind in ("when",):
+                match = re.match(r"(?P<c>.+?),\s*(?P<main>.+)", piece, re.DOTALL)
+                if match and self._reader.starts(_first_chunk(match["main"])):
+                    self._condition("when", match["c"])
+                    self._clauses(match["main"], None)
+                elif pending:
+                    old = len(self._graph.steps)
+                    self._late_condition(piece, pending[-1], sentence)
+                    del old
+                continue
+            if (
+                kind == "list"
+                and (match := _PREFIX.fullmatch(piece.strip()))
+                and self._prefixed(match["word"].lower(), match["rest"], None)
+            ):
+                continue
+            piece = self._spoken_to(piece.strip()) if kind != "list" or not pending or ":" in piece else piece
+            clause = self._reader.read(piece, speaking_to=self._to) or self._gapped(piece, self._last)
+            if clause is None:
+                self._lose(piece, len(piece.split()))
+                continue
+            self._lost += clause.lost
+            firsts, ends = self._emit(kind, clause, beside, sentence)
+            if kind == "after" and pending:
+                self._graph.order(ends, pending[-1])
+            pending.append(firsts)
+            beside = start if start is not None and clause.who.kind not in ("elided", "pronoun") else None
+
+    def _late_condition(self, text: str, firsts: set[int], sentence: Snapshot) -> None:
+        """Read "A once B", said in that order: B comes first."""
+        graph = self._graph
+        old = len(graph.steps)
+        if _DONE.fullmatch(_clean(text)) and len(graph.steps) > len(firsts):
+            graph.order(graph.lasts(set(range(old)) - firsts), firsts)
+            return
+        tails, thread = dict(graph.tails), graph.thread
+        graph.tails, graph.thread, graph.barrier = dict(sentence.tails), sentence.thread, sentence.barrier
+        graph.scope = set()
+        if self._reader.starts(_first_chunk(text)):
+            self._clauses(text, None)
+            graph.order(graph.lasts(range(old, len(graph.steps))), firsts)
+            graph.tails, graph.thread = {**graph.tails, **tails}, thread
+            return
+        graph.tails, graph.thread = tails, thread
+        self._lose(text, len(text.split()))
+
+    def _doers(self, who: Who) -> list[str]:
+        """Return the robots that a subject means now."""
+        mentions = self._reader.mentions
+        if who.kind in ("named", "all", "several"):
+            return who.robots
+        if who.kind == "one":
+            return ["any"]
+        if who.kind == "first":
+            return [mentions.group[0]] if mentions.group else ["any1"]
+        if who.kind == "other":
+            rest = [name for name in (self._names.roster or mentions.group) if name not in mentions.robots]
+            return rest[:1] if len(rest) == 1 else ["any2"]
+        if who.kind == "pronoun":
+            return mentions.robots or self._to
+        return self._to
+
+    def _emit(
+        self, kind: str, clause: Clause, beside: Snapshot | None, sentence: Snapshot
+    ) -> tuple[set[int], set[int]]:
+        graph = self._graph
+        assigned = [step.params["_robot"] for step in clause.steps if "_robot" in step.params]
+        robots = assigned or self._doers(clause.who)
+        explicit = clause.who.kind not in ("elided", "pronoun")
+        fresh = explicit and (kind != "list" or robots != self._to or clause.who.kind == "named")
+        computes = all(graph._catalogue.skills[step.skill].runs == "compute" for step in clause.steps)  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
+        if kind in ("then", "before") and (explicit or computes) and graph.scope:
+            graph.barrier |= graph.lasts(graph.scope)
+        if kind in ("beside", "after"):
+            if explicit and robots != self._to:
+                beside = Snapshot(
+                    {name: tail for name, tail in graph.tails.items() if not set(tail) & graph.scope},
+                    frozenset(),
+                    graph.barrier,
+                )
+                graph.scope = set()
+            else:
+                beside = graph.previous
+        if explicit and robots != self._to:
+            graph.thread = graph.thread if kind == "then" else frozenset()
+        del fresh
+        firsts, ends = graph.add(list(robots), clause.steps, beside=beside)
+        if explicit:
+            self._names.seen.update(robots)
+            self._to = list(robots)
+        if not computes or explicit:
+            self._mention(list(robots))
+        if clause.who.kind in ("first", "other", "one", "several"):
+            self._mention(list(robots))
+        self._remember(clause)
+        self._last = clause
+        return firsts, ends
+
+    def _remember(self, clause: Clause) -> None:
+        mentions = self._reader.mentions
+        for step in clause.steps:
+            for key in ("object", "target", "asset", "source"):
+                if value := step.params.get(key):
+                    mentions.thing = str(value)
+            for key in ("place", "area", "station"):
+                if value := step.params.get(key):
+                    mentions.place = str(value)
+                    if step.skill == "goto":
+                        mentions.thing = str(value)
+            if step.at:
+                mentions.place = step.at
+            if (to := step.params.get("to")) and step.skill in ("give", "say", "ask", "notify", "report"):
+                mentions.person = str(to)
+            if model := step.params.get("model"):
+                mentions.model = str(model)
+
+    def _lose(self, piece: str, words: int) -> None:
+        said = self._reader.unquote(" ".join(piece.split())).strip(" ,.:;")
+        bare = lx.FILLER.sub("", said).strip(" ,.:;")
+        if bare:
+            self._pieces.append(said)
+            self._lost += words
+
+
+def _first_chunk(text: str) -> str:
+    """Return the text up to its first connective, or a little more where that is no clause yet."""
+    match = _BETWEEN.search(text, 1)
+    return text[: match.start()] if match else text
+
+
+def _clean(text: str) -> str:
+    return text.strip(" ,.;:!?-\n\t")
+
+
+def _spread(match: re.Match[str]) -> str:
+    """Write "goals 1, 2 and 3" as "goal 1, goal 2 and goal 3"."""
+    head = match[1]
+    items = re.findall(r"\d+|\b[A-Z]\b", match[2])
+    named = [f"{lx.singular(head + 's')} {item}" for item in items]
+    return ", ".join(named[:-1]) + " and " + named[-1]
+
+
+def _renamed(subtask: Subtask, old: str, new: str) -> Subtask:
+    params = dict(subtask.params)
+    if "robots" in params:
+        params["robots"] = [new if name == old else name for name in params["robots"]]
+    robot = new if subtask.robot == old else subtask.robot
+    return Subtask(id=subtask.id, skill=subtask.skill, robot=robot, params=params, after=subtask.after)

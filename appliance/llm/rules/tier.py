@@ -1,0 +1,61 @@
+"""The tier that is always there: pure parsing, no model, no network, milliseconds."""
+
+from appliance.errors import PlanError
+from appliance.llm.rules.domains import domain_of
+from appliance.llm.rules.parser import Parser, Reading
+from appliance.llm.settings import PlanContext
+from appliance.llm.tier import Proposal
+from appliance.model import Plan, Tier
+from appliance.skills.catalogue import Catalogue
+
+MAX_CHARACTERS = 4000
+"""Longer text is no plain instruction."""
+
+
+def read(context: PlanContext, catalogue: Catalogue) -> tuple[Plan, Reading]:
+    """Parse an instruction; pure. The plan may be empty or not valid: the caller decides.
+
+    Raises:
+        PlanError: the instruction is empty or too long.
+    """
+    text = context.instruction.strip()
+    if not text:
+        raise PlanError("the instruction is empty", remedy="say what a robot shall do")
+    if len(text) > MAX_CHARACTERS:
+        raise PlanError(
+            f"the instruction has {len(text)} characters", remedy=f"at most {MAX_CHARACTERS}; give it in parts"
+        )
+    reading = Parser(catalogue, robots=context.robots, site=context.site).parse(text)
+    domain = domain_of(reading.subtasks, catalogue)
+    return Plan(domain=domain, subtasks=reading.subtasks, tier=Tier.RULES, confidence=reading.confidence), reading
+
+
+class RulesTier:
+    """Plans by rules."""
+
+    name = Tier.RULES
+    repairs = False
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+
+    async def start(self) -> None:
+        """Nothing to make ready."""
+
+    async def propose(
+        self, context: PlanContext, *, previous: Plan | None = None, problems: tuple[str, ...] = ()
+    ) -> Proposal:
+        """Parse; PlanError names what was not understood when nothing was."""
+        del previous, problems
+        plan, reading = read(context, self._catalogue)
+        lost = tuple(f"not understood: {piece!r}" for piece in reading.lost)
+        if not plan.subtasks:
+            raise PlanError(
+                "the instruction was not understood",
+                problems=lost,
+                remedy='use plain orders, such as "Robot_1: go to goal 2, then photograph the shelf"',
+            )
+        return Proposal(plan=plan, confidence=reading.confidence, problems=lost)
+
+    async def close(self) -> None:
+        """Nothing to release."""
