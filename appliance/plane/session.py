@@ -339,6 +339,27 @@ class Session:
         token = self._raw.liveliness().declare_token(key)
         return Closer(token.undeclare)
 
+    async def alive_now(self, expr: str, *, timeout_s: float = 1.0) -> list[str]:
+        """Return the keys of the tokens that are there now; those that could be had in time."""
+        found: list[str] = []
+        ended = asyncio.Event()
+
+        def take(reply: zenoh.Reply) -> None:
+            if (sample := reply.ok) is not None:
+                self._inbox.post(partial(found.append, str(sample.key_expr)), must=True)
+
+        ask = partial(
+            self._raw.liveliness().get,
+            expr,
+            Callback(take, drop=lambda: self._inbox.post(ended.set, must=True) and None, indirect=False),
+            timeout=timeout_s,
+        )
+        self._send(expr, cast("Callable[[], None]", ask), 0)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return sorted(found)
+
     def watch_alive(self, expr: str, callback: Callable[[str, bool], None]) -> Closer:
         """Have the coming (True) and going (False) of tokens delivered, those already there first."""
 

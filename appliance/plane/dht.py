@@ -1,0 +1,315 @@
+"""Replicated records: each key has an owner on the ring that orders its writes, and r-1 further replicas.
+
+A write goes to the owner, which compares the version the writer saw with its own, stores, and has the replicas
+store before it acknowledges. When the owner dies its successor on the ring, a replica, is the owner; `reconcile`
+brings every gateway up to date before it answers for keys that have become its own. Two owners at once (views of
+the membership differ for a moment, or a partition) make concurrent versions, which every gateway resolves alike.
+"""
+
+import asyncio
+import contextlib
+import uuid
+from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
+from typing import Any
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import ConflictError, DeadlineError, RefusedError, SwiftbotError, UnreachableError
+from appliance.model import VersionVector
+from appliance.plane.membership import Membership
+from appliance.plane.ring import Ring
+from appliance.plane.rpc import Rpc
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.store import Store
+from appliance.plane.versions import (
+    Behind,
+    Record,
+    Resolver,
+    Write,
+    by_bytes,
+    check_key,
+    check_record,
+    check_write,
+    decide,
+    settle,
+)
+
+__all__ = ["Dht", "Record", "Resolver"]
+
+log = structlog.get_logger(__name__)
+
+_ATTEMPT_S = 1.5
+"""One try at an owner: longer than it waits for its replicas, shorter than the whole write."""
+_AGAIN_S = 0.03
+"""Between tries while the membership settles."""
+_SETTLE_S = 2.0
+"""How long an owner lets requests wait for its reconciling; then it answers with what it has."""
+_PUSH_AGAIN_S = (0.5, 2.0)
+"""When a replica that was too slow for a write is offered the record again."""
+_MOST_PUSHES = 256
+
+
+class KeyAsk(Struct, frozen=True):
+    """`dht_read`: the record of a key, from this gateway's shard."""
+
+    key: str
+
+
+class Found(Struct, frozen=True, omit_defaults=True):
+    """Answer with a record, or that there is none."""
+
+    record: Record | None = None
+
+
+class StoreAsk(Struct, frozen=True):
+    """`dht_store`: keep this version, unless a newer one is here."""
+
+    record: Record
+
+
+class Written(Struct, frozen=True):
+    """`dht_write` done: the version it made."""
+
+    version: VersionVector
+
+
+class Dht:
+    """The replicated records as one gateway sees them."""
+
+    def __init__(self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership) -> None:
+        self.resolver: Resolver | None = None
+        self.on_ring_change: list[Callable[[], None]] = []
+        self._config = config
+        self._gateway = gateway
+        self._store = store
+        self._rpc = rpc
+        self._membership = membership
+        self._settled = Ring((), virtual_nodes=config.virtual_nodes)
+        self._settling = asyncio.Condition()
+        self._pushes: set[asyncio.Task[None]] = set()
+        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False)
+        rpc.register("dht_write", Write, self._on_write, exchange=False)
+        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False)
+
+    # --- the door ---------------------------------------------------------------------------------------------
+
+    async def read(self, key: str) -> Record | None:
+        """Return a record from its owner or, when that does not answer, the next replica; None: there is none.
+
+        Raises:
+            UnreachableError: none of the replicas answered.
+        """
+        check_key(key)
+        problem: SwiftbotError | None = None
+        for gateway in self._replicas(key):
+            try:
+                if gateway == self._gateway:
+                    record = (await self._on_read(KeyAsk(key))).record
+                else:
+                    found = await self._rpc.call(gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S)
+                    record = found.record
+            except (UnreachableError, DeadlineError, RefusedError) as error:
+                problem = error
+                continue
+            return None if record is None or record.deleted else record
+        raise UnreachableError(f"no replica of {key} answers: {problem}", remedy="try again in a second")
+
+    async def write(
+        self, key: str, value: bytes, *, expected: VersionVector | None, durable: bool = True
+    ) -> VersionVector:
+        """Compare and set: `expected` is the version that was read, None when there must be no record.
+
+        Returns:
+            The new version; by then the value is on the disk of the owner and of every reachable replica (not
+            `durable`: written, but the last moments may be lost with the power of all of them).
+
+        Raises:
+            ConflictError: the record has moved on; read, decide again, retry.
+            UnreachableError: no owner could be reached within `write_timeout_s`; it may or may not be written.
+            PayloadError: the value or key is too large.
+        """
+        asked = Write(key=key, value=value, expected=expected, write=uuid.uuid4().hex, durable=durable)
+        return await self._write(asked)
+
+    async def remove(self, key: str, *, expected: VersionVector) -> None:
+        """Remove a record; errors as for `write`."""
+        await self._write(Write(key=key, deleted=True, expected=expected, write=uuid.uuid4().hex))
+
+    def owns(self, key: str) -> bool:
+        """Whether a key belongs to this gateway just now."""
+        return self._membership.ring.owner(key) == self._gateway
+
+    async def local(self, prefix: str) -> list[Record]:
+        """Return this gateway's shard: the records it holds, as owner or replica, without those removed."""
+        return [record for record in await self._store.records(prefix) if not record.deleted]
+
+    # --- writing ----------------------------------------------------------------------------------------------
+
+    async def _write(self, asked: Write) -> VersionVector:
+        check_write(asked, max_bytes=self._config.max_record_bytes)
+        loop = asyncio.get_running_loop()
+        until = loop.time() + self._config.write_timeout_s
+        while True:
+            owner = self._membership.ring.owner(asked.key)
+            try:
+                if owner == self._gateway:
+                    return (await self._on_write(asked)).version
+                answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S)
+            except (UnreachableError, DeadlineError, RefusedError) as error:
+                # Dead, not yet known to be; or of another mind about who owns the key: both pass.
+                if loop.time() > until:
+                    raise UnreachableError(
+                        f"{asked.key} could not be written: {error}", remedy="try again; it may have been written"
+                    ) from error
+                await asyncio.sleep(_AGAIN_S)
+            else:
+                return answer.version
+
+    async def _on_write(self, asked: Write) -> Written:
+        """Order a write as the owner of its key, and have the replicas follow."""
+        check_write(asked, max_bytes=self._config.max_record_bytes)
+        if not self.owns(asked.key):
+            owner = self._membership.ring.owner(asked.key)
+            raise RefusedError(f"{asked.key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
+        await self._until_settled(asked.key)
+        try:
+            record = await self._decide(asked)
+        except Behind:
+            await self._catch_up(asked.key)
+            try:
+                record = await self._decide(asked)
+            except Behind:
+                raise ConflictError(
+                    f"{asked.key}: nobody here knows the version expected", remedy="read it and decide again"
+                ) from None
+        return Written(await self._replicate(record, asked))
+
+    async def _decide(self, asked: Write) -> Record:
+        record = await self._store.change(
+            asked.key, lambda current: decide(current, asked, self._gateway), durable=asked.durable
+        )
+        if record is None:
+            raise SwiftbotError("a decision without a record")
+        return record
+
+    async def _replicate(self, record: Record, asked: Write) -> VersionVector:
+        """Have the other replicas store a record; returns its version once they and this gateway agree."""
+        others = [each for each in self._replicas(record.key) if each != self._gateway]
+        answers = await asyncio.gather(*(self._push(each, record) for each in others))
+        newer = [answer for answer in answers if answer is not None]
+        if not newer:
+            return record.version
+        # A replica held a version that this owner had not seen: both now hold what `settle` made of the two.
+        for each in newer:
+            record = await self.keep(each)
+        if record.write != asked.write:
+            raise ConflictError(f"{record.key} was written elsewhere too", remedy="read it and decide again")
+        await asyncio.gather(*(self._push(each, record) for each in others))
+        return record.version
+
+    async def _push(self, gateway: str, record: Record) -> Record | None:
+        """Have a replica store a record; returns what it holds if that is something else."""
+        timeout_s = self._config.replica_timeout_s
+        try:
+            answer = await self._rpc.call(gateway, "dht_store", StoreAsk(record), Found, timeout_s=timeout_s)
+        except UnreachableError:
+            return None  # gone: its successor in the replica set takes the record when it reconciles
+        except (DeadlineError, RefusedError) as error:
+            log.warning("a replica is slow", replica=gateway, key=record.key, reason=str(error))
+            self._later(self._push_again(gateway, record.key))
+            return None
+        except SwiftbotError as error:
+            log.error("a replica cannot store", replica=gateway, key=record.key, reason=str(error))
+            return None
+        return answer.record
+
+    def _later(self, push: Coroutine[Any, Any, None]) -> None:
+        if len(self._pushes) >= _MOST_PUSHES:
+            push.close()  # anti-entropy will find it
+            return
+        task = asyncio.create_task(push)
+        self._pushes.add(task)
+        task.add_done_callback(self._pushes.discard)
+
+    async def _push_again(self, gateway: str, key: str) -> None:
+        for wait_s in _PUSH_AGAIN_S:
+            await asyncio.sleep(wait_s)
+            record = await self._store.record(key)
+            if record is None or gateway not in self._membership.members:
+                return
+            with contextlib.suppress(SwiftbotError):
+                answer = await self._rpc.call(gateway, "dht_store", StoreAsk(record), Found, timeout_s=_ATTEMPT_S)
+                if answer.record is not None:
+                    await self.keep(answer.record)
+                return
+
+    async def _catch_up(self, key: str) -> None:
+        """Ask every other replica for its version: the writer has seen one newer than ours."""
+
+        async def ask(gateway: str) -> None:
+            with contextlib.suppress(SwiftbotError):
+                found = await self._rpc.call(
+                    gateway, "dht_read", KeyAsk(key), Found, timeout_s=self._config.replica_timeout_s
+                )
+                if found.record is not None:
+                    await self.keep(found.record)
+
+        # One more than the replicas: the owner before the last change of membership may hold it.
+        near = self._membership.ring.successors(key, self._config.replicas + 1)
+        await asyncio.gather(*(ask(each) for each in near if each != self._gateway))
+
+    # --- answering --------------------------------------------------------------------------------------------
+
+    async def _on_read(self, asked: KeyAsk) -> Found:
+        check_key(asked.key)
+        if self.owns(asked.key):
+            await self._until_settled(asked.key)
+        return Found(await self._store.record(asked.key))
+
+    async def _on_store(self, asked: StoreAsk) -> Found:
+        check_record(asked.record, max_bytes=self._config.max_record_bytes)
+        kept = await self.keep(asked.record)
+        return Found(None if kept == asked.record else kept)
+
+    async def keep(self, record: Record) -> Record:
+        """Store what stands of a version from elsewhere and the one here; returns it."""
+        resolver = self.resolver or by_bytes
+        kept = await self._store.change(record.key, partial(_settle, record, resolver))
+        return record if kept is None else kept
+
+    def _replicas(self, key: str) -> tuple[str, ...]:
+        return self._membership.ring.successors(key, self._config.replicas)
+
+    # --- settling ---------------------------------------------------------------------------------------------
+
+    async def settled(self, ring: Ring) -> None:
+        """The shard has been reconciled with the members of that ring: what waited for it goes on."""
+        self._settled = ring
+        async with self._settling:
+            self._settling.notify_all()
+
+    async def _until_settled(self, key: str) -> None:
+        """Wait until this gateway has reconciled as the key's owner; it may have become that just now."""
+
+        def mine() -> bool:
+            return bool(self._settled.members) and self._settled.owner(key) == self._gateway
+
+        if mine():
+            return
+        try:
+            async with asyncio.timeout(_SETTLE_S), self._settling:
+                await self._settling.wait_for(mine)
+        except TimeoutError:
+            log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
+
+    async def close(self) -> None:
+        """Give up what is still being pushed."""
+        for task in self._pushes:
+            task.cancel()
+        await asyncio.gather(*self._pushes, return_exceptions=True)
+
+
+def _settle(other: Record, resolver: Resolver, mine: Record | None) -> Record:
+    return settle(mine, other, resolver)

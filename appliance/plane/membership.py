@@ -1,0 +1,75 @@
+"""Who is there: the gateways whose liveliness token is seen, and the ring made of them.
+
+A token goes when its process dies (at once) or its link has been silent for a lease, so nobody is asked.
+"""
+
+from collections.abc import Callable
+
+import structlog
+
+from appliance.errors import PayloadError
+from appliance.plane.keys import check_name
+from appliance.plane.ring import Ring
+from appliance.plane.session import Closer, Session
+
+log = structlog.get_logger(__name__)
+
+MOST = 1000
+"""Gateways known at once; liveliness of more costs too much (design/platform). More are refused and counted."""
+
+
+class Membership:
+    """The gateways of a fleet as this process sees them. `gateway` is this one's id; None for clients."""
+
+    def __init__(self, session: Session, *, gateway: str | None, virtual_nodes: int) -> None:
+        self._session = session
+        self._gateway = gateway
+        self._virtual_nodes = virtual_nodes
+        self._members: frozenset[str] = frozenset() if gateway is None else frozenset({gateway})
+        self.ring = Ring(self._members, virtual_nodes=virtual_nodes)
+        self.on_joined: list[Callable[[str], None]] = []
+        self.on_lost: list[Callable[[str], None]] = []
+        self._watch: Closer | None = None
+        self._token: Closer | None = None
+
+    @property
+    def members(self) -> frozenset[str]:
+        """Ids of the gateways that are there; this one counts itself in."""
+        return self._members
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._watch = self._session.watch_alive(self._session.keys.alive(), self._seen)
+
+    def add(self, name: str) -> None:
+        """Count a gateway in before its token is watched."""
+        self._seen(self._session.keys.alive(name), alive=True)
+
+    def join(self) -> None:
+        """Show the others that this gateway is there."""
+        if self._gateway is not None:
+            self._token = self._session.declare_alive(self._session.keys.alive(self._gateway))
+
+    def _seen(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's callback signature
+        name = key.split("/")[-2]
+        if name == self._gateway or alive == (name in self._members):
+            return
+        try:
+            check_name(name, "gateway")
+        except PayloadError as error:
+            self._session.refuse("malformed gw/*/alive", key=key, reason=str(error))
+            return
+        if alive and len(self._members) >= MOST:
+            self._session.refuse("too many gateways", key=key)
+            return
+        self._members = self._members | {name} if alive else self._members - {name}
+        self.ring = Ring(self._members, virtual_nodes=self._virtual_nodes)
+        log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
+        for callback in tuple(self.on_joined if alive else self.on_lost):
+            callback(name)
+
+    def close(self) -> None:
+        """Leave: the token is taken back first, so the others take over before this gateway stops answering."""
+        for closer in (self._token, self._watch):
+            if closer is not None:
+                closer.close()

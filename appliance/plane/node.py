@@ -1,0 +1,182 @@
+"""One gateway's part in the plane, or a client's: session, RPC, membership, records and registry put together."""
+
+import asyncio
+import contextlib
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import structlog
+
+from appliance.errors import ConfigError, UnreachableError
+from appliance.plane.dht import Dht
+from appliance.plane.keys import Keys, check_name
+from appliance.plane.membership import Membership
+from appliance.plane.reconcile import Reconciler
+from appliance.plane.registry import Registry
+from appliance.plane.ring import Ring
+from appliance.plane.rpc import Rpc
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.store import Store
+
+log = structlog.get_logger(__name__)
+
+STORE_FILE = "gateway.sqlite"
+
+
+class Plane:
+    """A gateway's membership in the fleet; made by `open`, ended by `close`."""
+
+    def __init__(self, config: PlaneConfig, *, session: Session, store: Store, gateway: str) -> None:
+        self.config = config
+        self.gateway = gateway
+        self.session = session
+        self.store = store
+        self.keys: Keys = session.keys
+        self.rpc = Rpc(session, gateway)
+        self._membership = Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
+        self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
+        self.dht = Dht(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
+        self._reconciler = Reconciler(
+            config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, dht=self.dht
+        )
+        self.on_member_lost: list[Callable[[str], None]] = self._membership.on_lost
+
+    @classmethod
+    async def open(cls, config: PlaneConfig, *, fleet: str, gateway: str, data_dir: Path) -> "Plane":
+        """Open the session and the store, fetch what this gateway will own, and join.
+
+        Raises:
+            ConfigError: a setting is wrong, an endpoint or the store is in use, the id is taken.
+            PrerequisiteError: the disk is full or fails.
+        """
+        check_name(gateway, "gateway")
+        session = await Session.open(config, fleet)
+        store: Store | None = None
+        plane: Plane | None = None
+        try:
+            store = await Store.open(data_dir / STORE_FILE)
+            plane = cls(config, session=session, store=store, gateway=gateway)
+            await plane._join()
+        except BaseException:
+            if plane is not None:
+                await plane.close()
+            else:
+                if store is not None:
+                    await store.close()
+                await session.close()
+            raise
+        return plane
+
+    async def _join(self) -> None:
+        membership = self._membership
+        if self.config.connect:
+            await self._first_link()
+        if await self._taken():
+            raise ConfigError(
+                f"a gateway named {self.gateway} is already in fleet {self.keys.fleet}",
+                remedy="give each gateway an id of its own",
+            )
+        for name in await self._present():
+            membership.add(name)
+        membership.start()
+        self.registry.start()
+        await self._reconciler.join()
+        membership.join()
+        self._reconciler.start()
+        log.info("joined", gateway=self.gateway, members=sorted(membership.members))
+
+    async def _first_link(self) -> None:
+        """Wait a moment for the first link: only then is it known who is there already."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.config.join_wait_s):
+                while not self.session.linked:
+                    await asyncio.sleep(0.005)
+
+    async def _taken(self) -> bool:
+        """Whether another process shows our token; one that was killed may do so for a lease."""
+        key = self.keys.alive(self.gateway)
+        until = asyncio.get_running_loop().time() + 2 * self.config.lease_ms / 1e3
+        while await self.session.alive_now(key):
+            if asyncio.get_running_loop().time() > until:
+                return True
+            await asyncio.sleep(0.1)
+        return False
+
+    async def _present(self) -> list[str]:
+        return [key.split("/")[-2] for key in await self.session.alive_now(self.keys.alive())]
+
+    @property
+    def ring(self) -> Ring:
+        """The ring of the gateways that are there just now."""
+        return self._membership.ring
+
+    def members(self) -> frozenset[str]:
+        """Ids of the gateways that are there, this one among them."""
+        return self._membership.members
+
+    async def close(self) -> None:
+        """Leave the fleet and close the store; more than once does no harm."""
+        self._membership.close()
+        await self._reconciler.close()
+        await self.dht.close()
+        await self.registry.close()
+        self.rpc.close()
+        await self.session.close()
+        await self.store.close()
+
+
+class PlaneClient:
+    """Everybody else's connection: command line, terminal UI, recorder, robots. Owns nothing on the ring."""
+
+    def __init__(self, config: PlaneConfig, *, session: Session) -> None:
+        self.config = config
+        self.session = session
+        self.keys: Keys = session.keys
+        self.rpc = Rpc(session, None)
+        self._membership = Membership(session, gateway=None, virtual_nodes=config.virtual_nodes)
+        self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=None)
+        self._came = asyncio.Event()
+        self._gateway = ""
+
+    @classmethod
+    async def open(cls, config: PlaneConfig, *, fleet: str) -> "PlaneClient":
+        """Connect; the facts that are there come in within milliseconds.
+
+        Raises:
+            ConfigError: a setting is wrong.
+            UnreachableError: no endpoint answers.
+        """
+        client = cls(config, session=await Session.open(config, fleet))
+        client._membership.on_joined.append(lambda _: client._came.set())
+        client._membership.start()
+        client.registry.start()
+        return client
+
+    def members(self) -> frozenset[str]:
+        """Ids of the gateways that are there."""
+        return self._membership.members
+
+    async def any_gateway(self, *, timeout_s: float = 3.0) -> str:
+        """Return a gateway that is there, the same one while it is; UnreachableError when there is none."""
+        until = asyncio.get_running_loop().time() + timeout_s
+        while not self.members():
+            self._came.clear()
+            try:
+                async with asyncio.timeout_at(until):
+                    await self._came.wait()
+            except TimeoutError:
+                raise UnreachableError(
+                    f"no gateway of fleet {self.keys.fleet} is there",
+                    remedy=f"is the fleet name right, and is it up? asked at {', '.join(self.config.connect)}",
+                ) from None
+        if self._gateway not in self.members():
+            self._gateway = random.choice(sorted(self.members()))  # noqa: S311 - spreads load, protects nothing
+        return self._gateway
+
+    async def close(self) -> None:
+        """Disconnect."""
+        self._membership.close()
+        await self.registry.close()
+        await self.session.close()

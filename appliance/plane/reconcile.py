@@ -1,0 +1,272 @@
+"""Anti-entropy: every gateway fetches from the others what it should hold and does not.
+
+Runs when the membership changes (a joiner gets the records it now owns, the next replica those of a dead one) and
+every few seconds besides. Two gateways compare one hash of all the records they share; only if it differs, digests
+key by key; only what differs is sent. Each side fetches for itself, so one rule serves joining, leaving, restart
+and repair. Copies that belong elsewhere are handed over, and dropped when every replica has them.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import PayloadError, RefusedError, SwiftbotError
+from appliance.plane.dht import Dht, Found, StoreAsk
+from appliance.plane.membership import Membership
+from appliance.plane.ring import Ring
+from appliance.plane.rpc import Rpc
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.store import Store
+from appliance.plane.versions import Record, check_record, summary
+
+log = structlog.get_logger(__name__)
+
+_PAGE = 4000
+"""Digests in one answer: at most about 2 MB."""
+_FETCH_BYTES = 2 * 2**20
+"""Values in one answer, unless a single one is larger."""
+_ASK_S = 2.0
+_SEE_S = 1.0
+"""How long a member waits to see the token of the one that asks."""
+_AGAIN_S = 1.0
+"""After a member could not be compared with."""
+_BREATH = 500
+"""Keys looked at before the loop gets a turn."""
+
+
+class DigestAsk(Struct, frozen=True, omit_defaults=True):
+    """`dht_digest`: which records that I (`asker`) should hold have you? `joining`: my token is not up yet."""
+
+    asker: str
+    summary: str = ""
+    """Of the asker's copies; when the other's is the same, there is nothing to tell."""
+    after: str = ""
+    joining: bool = False
+
+
+class DigestList(Struct, frozen=True, omit_defaults=True):
+    """Key -> digest, in order of keys; `more` when it was cut."""
+
+    digests: dict[str, str] = {}
+    same: bool = False
+    more: bool = False
+
+
+class FetchAsk(Struct, frozen=True):
+    """`dht_fetch`: these records, or as many of the first as fit."""
+
+    keys: tuple[str, ...]
+
+
+class FetchList(Struct, frozen=True):
+    """The records; keys that are gone are left out."""
+
+    records: tuple[Record, ...]
+    more: bool = False
+
+
+class Reconciler:
+    """Keeps one gateway's shard in step with the others'."""
+
+    def __init__(
+        self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership, dht: Dht
+    ) -> None:
+        self._config = config
+        self._gateway = gateway
+        self._store = store
+        self._rpc = rpc
+        self._membership = membership
+        self._dht = dht
+        self._changed = asyncio.Event()
+        self._seen = asyncio.Condition()
+        self._running: asyncio.Task[None] | None = None
+        self._waking: set[asyncio.Task[None]] = set()
+        rpc.register("dht_digest", DigestAsk, self._on_digest, exchange=False)
+        rpc.register("dht_fetch", FetchAsk, self._on_fetch, exchange=False)
+        membership.on_joined.append(self._on_member)
+        membership.on_lost.append(self._on_member)
+
+    def start(self) -> None:
+        """Reconcile now, at every change of membership, and every `anti_entropy_s`."""
+        self._changed.set()
+        self._running = asyncio.create_task(self._run(), name="reconcile")
+
+    def _on_member(self, _: str) -> None:
+        self._changed.set()
+        task = asyncio.create_task(self._wake())
+        self._waking.add(task)
+        task.add_done_callback(self._waking.discard)
+
+    async def _wake(self) -> None:
+        async with self._seen:
+            self._seen.notify_all()
+
+    async def _run(self) -> None:
+        settled: Ring | None = None
+        wait_s = 0.0
+        while True:
+            try:
+                async with asyncio.timeout(wait_s):
+                    await self._changed.wait()
+            except TimeoutError:
+                pass
+            self._changed.clear()
+            ring = self._membership.ring
+            try:
+                complete = await self._round(ring)
+            except Exception:  # supervision boundary: repair must go on whatever one round ran into
+                log.exception("reconciling failed")
+                complete = False
+            wait_s = self._config.anti_entropy_s if complete else _AGAIN_S
+            if ring != self._membership.ring:
+                wait_s = 0.0
+                continue
+            if ring != settled:
+                settled = ring
+                await self._dht.settled(ring)
+                self._tell(self._dht.on_ring_change)
+
+    def _tell(self, callbacks: list[Callable[[], None]]) -> None:
+        for callback in tuple(callbacks):
+            try:
+                callback()
+            except Exception:  # supervision boundary: one listener's defect must not stop the repair
+                log.exception("a listener to the ring failed")
+
+    async def _round(self, ring: Ring) -> bool:
+        """Compare with every other member; False when one could not be asked."""
+        results = await asyncio.gather(*(self._pull(each, ring) for each in sorted(ring.members - {self._gateway})))
+        handed = await self._hand_over(ring)
+        before_ns = time.time_ns() - int(self._config.tombstone_hours * 3.6e12)
+        await self._store.forget_tombstones(before_ns)
+        return all(results) and handed
+
+    async def join(self) -> None:
+        """Fetch what this gateway will own before it shows itself, so that its first requests wait less."""
+        ring = self._membership.ring
+        await asyncio.gather(*(self._pull(each, ring, joining=True) for each in sorted(ring.members - {self._gateway})))
+
+    # --- fetching ---------------------------------------------------------------------------------------------
+
+    async def _pull(self, member: str, ring: Ring, *, joining: bool = False) -> bool:
+        try:
+            fetched = await self._pull_from(member, ring, joining=joining)
+        except SwiftbotError as error:
+            if member in self._membership.members:
+                log.warning("could not compare with a member", member=member, reason=str(error))
+                return False
+            return True
+        if fetched:
+            log.info("fetched records", member=member, records=fetched)
+        return True
+
+    async def _pull_from(self, member: str, ring: Ring, *, joining: bool) -> int:
+        mine = dict(await self._store.digests())
+        shared: list[str] = []
+        for number, (key, each) in enumerate(mine.items()):
+            replicas = ring.successors(key, self._config.replicas)
+            if member in replicas and self._gateway in replicas:
+                shared.append(each)
+            if number % _BREATH == _BREATH - 1:
+                await asyncio.sleep(0)
+        asked = DigestAsk(asker=self._gateway, summary=summary(shared), joining=joining)
+        fetched = 0
+        while True:
+            answer = await self._rpc.call(member, "dht_digest", asked, DigestList, timeout_s=_ASK_S + _SEE_S)
+            if answer.same:
+                return fetched
+            wanted = [key for key, each in answer.digests.items() if mine.get(key) != each]
+            fetched += await self._fetch(member, wanted)
+            if not answer.more or not answer.digests:
+                return fetched
+            asked = DigestAsk(asker=self._gateway, after=max(answer.digests), joining=joining)
+
+    async def _fetch(self, member: str, keys: list[str]) -> int:
+        done = 0
+        while keys:
+            page = keys[:_PAGE]
+            answer = await self._rpc.call(member, "dht_fetch", FetchAsk(tuple(page)), FetchList, timeout_s=_ASK_S)
+            for record in answer.records:
+                check_record(record, max_bytes=self._config.max_record_bytes)
+            await asyncio.gather(*(self._dht.keep(record) for record in answer.records))
+            done += len(answer.records)
+            if answer.more and answer.records:
+                last = answer.records[-1].key
+                keys = keys[page.index(last) + 1 :] if last in page else []
+            else:
+                keys = keys[len(page) :]
+        return done
+
+    async def _hand_over(self, ring: Ring) -> bool:
+        """Give copies that belong elsewhere to all their replicas, then drop them; False when one did not take it."""
+        complete = True
+        for number, (key, _) in enumerate(await self._store.digests()):
+            if number % _BREATH == _BREATH - 1:
+                await asyncio.sleep(0)
+            replicas = ring.successors(key, self._config.replicas)
+            if self._gateway in replicas:
+                continue
+            record = await self._store.record(key)
+            if record is None:
+                continue
+            ask = StoreAsk(record)
+            try:
+                for each in replicas:
+                    await self._rpc.call(each, "dht_store", ask, Found, timeout_s=_ASK_S)
+            except SwiftbotError as error:
+                log.warning("a copy that belongs elsewhere is kept", key=key, reason=str(error))
+                complete = False
+                continue
+            if ring == self._membership.ring:
+                await self._store.forget(record)
+        return complete
+
+    # --- answering --------------------------------------------------------------------------------------------
+
+    async def _on_digest(self, asked: DigestAsk) -> DigestList:
+        if not asked.joining:
+            await self._until_seen(asked.asker)
+        ring = self._membership.ring.with_member(asked.asker)
+        found: list[tuple[str, str]] = []
+        for number, (key, each) in enumerate(await self._store.digests()):
+            if asked.asker in ring.successors(key, self._config.replicas):
+                found.append((key, each))
+            if number % _BREATH == _BREATH - 1:
+                await asyncio.sleep(0)
+        if asked.summary and asked.summary == summary([each for _, each in found]):
+            return DigestList(same=True)
+        rest = [(key, each) for key, each in found if key > asked.after]
+        return DigestList(digests=dict(rest[:_PAGE]), more=len(rest) > _PAGE)
+
+    async def _until_seen(self, asker: str) -> None:
+        """From when this answers on, this gateway no longer orders writes of keys that the asker owns."""
+        try:
+            async with asyncio.timeout(_SEE_S), self._seen:
+                await self._seen.wait_for(lambda: asker in self._membership.members)
+        except TimeoutError:
+            raise RefusedError(f"{self._gateway} does not see {asker}", remedy="are the two linked?") from None
+
+    async def _on_fetch(self, asked: FetchAsk) -> FetchList:
+        if len(asked.keys) > _PAGE:
+            raise PayloadError(f"{len(asked.keys)} records at once", remedy=f"at most {_PAGE}")
+        records: list[Record] = []
+        size = 0
+        for key in asked.keys:
+            record = await self._store.record(key)
+            if record is None:
+                continue
+            size += len(record.value)
+            if records and size > _FETCH_BYTES:
+                return FetchList(tuple(records), more=True)
+            records.append(record)
+        return FetchList(tuple(records))
+
+    async def close(self) -> None:
+        """Stop reconciling."""
+        tasks = [task for task in (self._running, *self._waking) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
