@@ -27,6 +27,7 @@ done
 PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
   python3 python3-venv rsync ca-certificates)
 [ "$MODE" = dev ] && PACKAGES+=(systemd)
+API_STALE=
 RANGE=65536           # ids that a rootless container may use
 NEED_FRESH_MB=4000    # environment, its downloads, images: measured 2.6 GB, and room to work
 NEED_AGAIN_MB=300
@@ -201,9 +202,16 @@ native_overlay() {
     { chmod -R u+rwx work || true; }' >/dev/null 2>&1
 }
 
+# user_file PATH TEXT: writes a file of the working user's that is not there yet.
+user_file() {
+  local file=$1
+  (cd / && as_user mkdir -p "$(dirname "$file")" && printf '%s' "$2" | as_user tee "$file") >/dev/null 2>"$LOG" ||
+    fail "writing $file" "check who owns $USER_HOME/.config"
+}
+
 configure_storage() {
   local file=$USER_HOME/.config/containers/storage.conf options=
-  [ -e "$file" ] && return
+  if [ -e "$file" ]; then return; fi
   if (cd / && native_overlay); then
     say "storage: overlay by the kernel"
   else
@@ -211,22 +219,19 @@ configure_storage() {
     [ -e /dev/fuse ] || say "storage: /dev/fuse is missing, containers will not start (modprobe fuse, or give it to this machine)"
     options=$'[storage.options.overlay]\nmount_program = "/usr/bin/fuse-overlayfs"\n'
   fi
-  printf '[storage]\ndriver = "overlay"\n%s' "$options" >"$LOG.conf"
-  chmod 0644 "$LOG.conf"
-  (cd / && as_user mkdir -p "$(dirname "$file")" && as_user cp "$LOG.conf" "$file") 2>"$LOG" || fail "writing $file" "check who owns $USER_HOME/.config"
-  rm -f "$LOG.conf"
+  user_file "$file" $'[storage]\ndriver = "overlay"\n'"$options"
 }
 
 # Podman before 4.4 takes its OCI runtime from here only; crun, its default, refuses cgroup v1 in hybrid mode.
-configure_runtime() {
-  local file=$USER_HOME/.config/containers/containers.conf
-  [ -e "$file" ] && return
-  [ "$(stat -f -c %T /sys/fs/cgroup 2>/dev/null)" = cgroup2fs ] && return
-  say "podman: runc, since this machine has no cgroup v2"
-  printf '[engine]\nruntime = "runc"\n' >"$LOG.conf"
-  chmod 0644 "$LOG.conf"
-  (cd / && as_user mkdir -p "$(dirname "$file")" && as_user cp "$LOG.conf" "$file") 2>"$LOG" || fail "writing $file" "check who owns $USER_HOME/.config"
-  rm -f "$LOG.conf"
+configure_engine() {
+  local file=$USER_HOME/.config/containers/containers.conf text=
+  if [ -e "$file" ]; then return; fi
+  if [ "$(stat -fc %T /sys/fs/cgroup 2>/dev/null)" != cgroup2fs ]; then text+=$'runtime = "runc"\n'; fi
+  if ! systemd_runs; then text+=$'cgroup_manager = "cgroupfs"\nevents_logger = "file"\n'; fi
+  if [ -z "$text" ]; then return; fi
+  say "podman: ${text//$'\n'/; }in containers.conf"
+  user_file "$file" $'[engine]\n'"$text"
+  API_STALE=1  # a service that runs already has read the old configuration
 }
 
 copy_tree() {
@@ -322,7 +327,7 @@ PYTHON
 }
 
 start_api() {
-  if api_answers; then return; fi
+  if [ -z "$API_STALE" ] && api_answers; then return; fi
   say "podman: starting the API socket $API_SOCKET"
   local pidfile=$RUNTIME_DIR/swiftbot-podman.pid apilog=$RUNTIME_DIR/swiftbot-podman.log pid tries=0
   : >"$LOG"
@@ -330,8 +335,8 @@ start_api() {
     fail "podman does not work for user $RUN_USER" "read the lines above; with 'cgroup' in them, the machine must give this user cgroups (cgroup v2, or v1 mounted); with 'newuidmap', check /etc/subuid and that newuidmap is setuid"
   if systemd_runs && [ -S "$RUNTIME_DIR/systemd/private" ]; then
     (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user enable --now podman.socket) || exit 1
-    # A socket file that lost its listener is made anew.
-    api_answers || (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user restart podman.socket) || exit 1
+    # A socket file that lost its listener is made anew; a service ends by itself and starts with the next request.
+    { [ -z "$API_STALE" ] && api_answers; } || (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user restart podman.socket podman.service) || exit 1
   else
     pid=$(cat "$pidfile" 2>/dev/null || true)
     if [ -n "$pid" ] && grep -qs podman "/proc/$pid/cmdline"; then kill "$pid" 2>/dev/null || true; fi
@@ -386,7 +391,7 @@ make_user
 give_ranges
 make_runtime_dir
 configure_storage
-configure_runtime
+configure_engine
 copy_tree
 make_environment
 install_package

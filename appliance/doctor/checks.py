@@ -1,0 +1,419 @@
+"""The checks themselves: each looks at one prerequisite and, when it is missing, says what to do.
+
+They exist because most of what keeps a gateway from working lies outside it: rootless Podman alone needs five
+things that no error message of Podman names together. A check that is not `required` is a limit to know about,
+not a reason to stay down. Nothing is changed on the machine but one container that is started and removed.
+"""
+
+import asyncio
+import secrets
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from msgspec import Struct
+
+from appliance.config import GatewayConfig
+from appliance.doctor.machine import Machine, ThisMachine
+from appliance.errors import SwiftbotError
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.engine import LIMITING, ContainerSpec, Engine, EngineFacts, PodmanEngine
+from appliance.pool.images import reference
+from appliance.pool.settings import PoolConfig
+from appliance.skills.catalogue import Catalogue, load_catalogue
+
+IDS_NEEDED = 65536
+"""Subordinate ids of a user: Debian's images use ids to 65534."""
+FREE_MB = 1024
+"""Two images and a day's log of a small fleet."""
+BUILT_AT = 1735689600.0
+"""2025-01-01: no clock is right that shows less."""
+CHECK_S = 20.0
+"""Longest that one check may take."""
+SETUP = "run `make setup`"
+SESSION_KEY = "swiftbot/doctor/check"
+
+
+class Check(Struct, frozen=True, kw_only=True):
+    """One prerequisite: what was found, and what to do when it is not `ok`."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+    required: bool = True
+
+
+def check_python(machine: Machine) -> Check:
+    """Python 3.11 or later."""
+    version = ".".join(str(part) for part in machine.python)
+    return Check(name="python", ok=machine.python >= (3, 11), detail=version, remedy="use Debian 12's python3 or later")
+
+
+def check_user(machine: Machine) -> Check:
+    """An ordinary user: rootless Podman is the wall between skills and the machine."""
+    return Check(
+        name="user",
+        ok=machine.uid != 0,
+        detail=f"{machine.user} ({machine.uid})",
+        remedy="run it as the service user: scripts/as_user.sh swiftbot doctor",
+    )
+
+
+def check_locale(machine: Machine) -> Check:
+    """UTF-8, for the plan graphs and the terminal UI."""
+    return Check(
+        name="locale",
+        ok=machine.encoding.lower().replace("-", "") == "utf8",
+        detail=machine.encoding,
+        remedy="export LANG=C.UTF-8",
+        required=False,
+    )
+
+
+def check_clock(machine: Machine) -> Check:
+    """A clock that is kept in time: logs are compared, and Zenoh refuses timestamps far ahead of its own."""
+    if machine.now() < BUILT_AT:
+        return Check(name="clock", ok=False, detail="years behind", remedy="set it: timedatectl set-time, or NTP")
+    kept = machine.clock_synchronised()
+    return Check(
+        name="clock",
+        ok=kept is not False,
+        detail={True: "kept in time", False: "nothing keeps it in time", None: "set; the kernel does not tell more"}[
+            kept
+        ],
+        remedy="apt-get install systemd-timesyncd (or chrony); gateways must agree to half a second",
+        required=False,
+    )
+
+
+def check_programs(machine: Machine) -> Iterator[Check]:
+    """Yield a check for each program that is called; id mappers must be allowed to do it as well."""
+    packages = {"podman": "podman", "newuidmap": "uidmap", "newgidmap": "uidmap", "mmdebstrap": "mmdebstrap"}
+    for program, package in packages.items():
+        path = machine.which(program)
+        ok, detail = path is not None, path or "not installed"
+        if path and package == "uidmap":
+            facts = machine.stat(Path(path))
+            if facts is None or not facts.privileged:
+                ok, detail = False, f"{path} is neither setuid root nor has capabilities"
+        yield Check(
+            name=program, ok=ok, detail=detail, remedy=f"apt-get install --reinstall --no-install-recommends {package}"
+        )
+    runtimes = [each for each in map(machine.which, ("crun", "runc")) if each]
+    yield Check(
+        name="runtime",
+        ok=bool(runtimes),
+        detail=", ".join(runtimes) or "neither crun nor runc is installed",
+        remedy="apt-get install crun runc",
+    )
+
+
+def check_ids(machine: Machine) -> Iterator[Check]:
+    """Yield whether the user has subordinate user and group ids."""
+    if machine.uid == 0:
+        return  # not the user that would need them; check_user says so
+    for name in ("subuid", "subgid"):
+        path = Path("/etc") / name
+        total = 0
+        for line in (machine.read(path) or "").splitlines():
+            owner, _, rest = line.partition(":")
+            count = rest.rpartition(":")[2]
+            if owner in (machine.user, str(machine.uid)) and count.isdecimal():
+                total += int(count)
+        option = f"--add-{name}s"
+        yield Check(
+            name=name,
+            ok=total >= IDS_NEEDED,
+            detail=f"{total} ids in {path}" if total else f"no range in {path}",
+            remedy=f"{SETUP}, or: usermod {option} FIRST-LAST {machine.user} with {IDS_NEEDED} ids nobody else has",
+        )
+
+
+def check_runtime_dir(machine: Machine) -> Check:
+    """XDG_RUNTIME_DIR: set, there, the user's own and closed to others."""
+    named = machine.environ.get("XDG_RUNTIME_DIR", "")
+    facts = machine.stat(Path(named)) if named else None
+    if not named:
+        detail = "not set"
+    elif facts is None:
+        detail = f"{named} is not there"
+    elif facts.owner != machine.uid or not facts.writable:
+        detail = f"{named} belongs to user {facts.owner}, not {machine.uid}"
+    elif facts.mode & 0o077:
+        detail = f"{named} is open to others (mode {facts.mode:o})"
+    else:
+        return Check(name="XDG_RUNTIME_DIR", ok=True, detail=named)
+    return Check(
+        name="XDG_RUNTIME_DIR",
+        ok=False,
+        detail=detail,
+        remedy=f"loginctl enable-linger {machine.user}; without systemd: {SETUP} (it makes /run/user/{machine.uid}, mode 0700)",
+    )
+
+
+def check_storage(machine: Machine) -> Check:
+    """Where storage.conf names fuse-overlayfs, it and /dev/fuse."""
+    folder = machine.environ.get("XDG_CONFIG_HOME") or f"{machine.home}/.config"
+    text = (
+        machine.read(Path(folder) / "containers" / "storage.conf")
+        or machine.read(Path("/etc/containers/storage.conf"))
+        or ""
+    )
+    lines = [line.strip() for line in text.splitlines()]
+    if not any(line.startswith("mount_program") and "fuse-overlayfs" in line for line in lines):
+        return Check(name="fuse-overlayfs", ok=True, detail="not used: overlay by the kernel")
+    if machine.which("fuse-overlayfs") is None:
+        return Check(name="fuse-overlayfs", ok=False, detail="not installed", remedy="apt-get install fuse-overlayfs")
+    device = machine.stat(Path("/dev/fuse"))
+    ok = device is not None and device.writable
+    return Check(
+        name="fuse-overlayfs",
+        ok=ok,
+        detail="installed" if ok else "/dev/fuse is not there or not open to this user",
+        remedy="modprobe fuse; in a container: start it with --device /dev/fuse",
+    )
+
+
+def check_disk(machine: Machine, folders: Sequence[Path]) -> Iterator[Check]:
+    """Yield the free space of each folder that grows; folders with the same free space are told once."""
+    told: set[int] = set()
+    for folder in folders:
+        free = machine.free_mb(folder)
+        if int(free) in told:
+            continue
+        told.add(int(free))
+        yield Check(
+            name="disk",
+            ok=free >= FREE_MB,
+            detail=f"{free:,.0f} MB free at {folder}",
+            remedy=f"free space to {FREE_MB} MB: podman image prune, old logs, or another folder in the configuration",
+        )
+
+
+def check_ports(machine: Machine, config: GatewayConfig) -> Iterator[Check]:
+    """Yield whether each port of a gateway's configuration can be taken, or is held by the running gateway."""
+    wanted: list[tuple[str, str, int, bool]] = []
+    for endpoint in config.plane.listen:
+        protocol, _, address = endpoint.partition("/")
+        parts = urlsplit(f"//{address}")
+        if parts.hostname and parts.port and protocol in ("tcp", "tls", "ws", "udp", "quic"):
+            wanted.append((endpoint, parts.hostname, parts.port, protocol in ("udp", "quic")))
+    for link in config.robots.mavlink:
+        host, port = link.address()
+        wanted.append((link.listen, host, port, True))
+    for name, host, port, udp in wanted:
+        problem = machine.bind_problem(host, port, udp=udp)
+        holder = machine.listener(port, udp=udp) if problem else ""
+        running = "swiftbot" in holder and "gateway" in holder
+        yield Check(
+            name=f"port {port}",
+            ok=not problem or running,
+            detail=f"{name} is free" if not problem else f"{name}: held by {holder or 'somebody else'} ({problem})",
+            remedy=f"end what holds it (ss -l{'u' if udp else 't'}np 'sport = :{port}'), or set another port",
+        )
+
+
+def check_model(machine: Machine, folder: str) -> Check:
+    """The local language model's folder, where one is configured."""
+    if not folder:
+        return Check(name="model", ok=True, detail="none configured: plans come from the other tiers", required=False)
+    ok = machine.stat(Path(folder) / "genai_config.json") is not None
+    return Check(
+        name="model",
+        ok=ok,
+        detail=folder if ok else f"{folder} has no genai_config.json",
+        remedy="set llm.local_model to a folder made for onnxruntime-genai, or leave it empty",
+        required=False,
+    )
+
+
+def podman_checks(facts: EngineFacts) -> Iterator[Check]:
+    """Yield what follows from Podman's own account."""
+    yield Check(name="podman api", ok=True, detail=f"Podman {facts.version}")
+    yield Check(
+        name="rootless", ok=facts.rootless, detail="yes" if facts.rootless else "Podman runs as root", remedy=SETUP
+    )
+    yield Check(
+        name="storage",
+        ok=facts.storage_driver == "overlay",
+        detail=facts.storage_driver,
+        remedy='write driver = "overlay" into ~/.config/containers/storage.conf, then podman system reset (removes images)',
+    )
+    missing = ", ".join(sorted(LIMITING - facts.controllers))
+    yield Check(
+        name="limits",
+        ok=facts.limits_enforced,
+        detail="memory, CPU and process limits of containers hold"
+        if facts.limits_enforced
+        else f"cgroup {facts.cgroup_version}: containers' memory, CPU and processes are not limited"
+        + (f" ({missing} not delegated)" if facts.cgroup_version == "v2" else ""),
+        remedy="boot with cgroup v2, and delegate cpu, memory and pids to users (user@.service.d, see docs/operations.md)",
+        required=False,
+    )
+
+
+async def check_images(engine: Engine, catalogue: Catalogue, config: PoolConfig) -> tuple[list[Check], str]:
+    """Return whether each image of the catalogue is there, and the first one that is."""
+    present = {tag for image in await engine.images() for tag in image.tags}
+    checks: list[Check] = []
+    usable = ""
+    for name, spec in catalogue.images.items():
+        full = reference(spec, config)
+        found = full in present
+        usable = usable or (full if found else "")
+        checks.append(
+            Check(
+                name=f"image {name}",
+                ok=found,
+                detail=full if found else f"{full} is not there",
+                remedy="swiftbot images build",
+            )
+        )
+    return checks, usable
+
+
+async def check_container(engine: Engine, image: str, runtime: str) -> Check:
+    """Start a container as the pool does and remove it: the only proof that runtime, ids and storage go together."""
+    name = f"swiftbot-doctor-{secrets.token_hex(4)}"
+    spec = ContainerSpec(
+        name=name,
+        image=image,
+        command=("/bin/true",),
+        labels={"swiftbot.doctor": name},
+        binds={},
+        volumes={},
+        environment={},
+        cpu=1.0,
+        memory_mb=64,
+        pids=32,
+        tmp_mb=4,
+        runtime=runtime,
+    )
+    try:
+        await engine.create(spec)
+        try:
+            await engine.start(name)
+        finally:
+            await engine.remove(name)
+    except SwiftbotError as error:
+        return Check(
+            name="container",
+            ok=False,
+            detail=error.message,
+            remedy=error.remedy
+            or "read the message; with 'cgroup' in it set pool.runtime to runc, with 'overlay' see storage",
+        )
+    return Check(name="container", ok=True, detail=f"starts{f' with {runtime}' if runtime else ''}")
+
+
+async def check_podman(make_engine: Callable[[], Engine], catalogue: Catalogue, config: PoolConfig) -> list[Check]:
+    """Ask Podman through its API socket; what cannot be told without it is told as such."""
+    try:
+        engine = make_engine()
+    except SwiftbotError as error:
+        return _podman_silent(error)
+    try:
+        facts = await engine.facts()
+        checks = list(podman_checks(facts))
+        images, usable = await check_images(engine, catalogue, config)
+        checks += images
+        if usable:
+            runtime = config.runtime or ("runc" if facts.cgroup_version == "v1" else "")
+            checks.append(await check_container(engine, usable, runtime))
+    except SwiftbotError as error:
+        return _podman_silent(error)
+    finally:
+        engine.close()
+    return checks
+
+
+def _podman_silent(error: SwiftbotError) -> list[Check]:
+    checks = [Check(name="podman api", ok=False, detail=error.message, remedy=error.remedy or SETUP)]
+    checks += [
+        Check(name=name, ok=False, detail="cannot be told: Podman does not answer", remedy="first see to: podman api")
+        for name in ("storage", "images", "container")
+    ]
+    return checks
+
+
+async def check_session(open_session: Callable[[], Awaitable[Session]]) -> Check:
+    """Open a Zenoh session on the loopback and have it answer itself."""
+    try:
+        session = await open_session()
+        try:
+
+            async def answer(_key: str, payload: bytes) -> bytes:
+                return payload
+
+            service = session.serve(SESSION_KEY, answer)
+            await session.query(SESSION_KEY, b"ping", timeout_s=5.0)
+            service.close()
+        finally:
+            await session.close()
+    except SwiftbotError as error:
+        return Check(name="zenoh", ok=False, detail=error.message, remedy=error.remedy or "see that the loopback is up")
+    return Check(name="zenoh", ok=True, detail="a session opens and answers")
+
+
+def _open_engine(config: PoolConfig) -> Callable[[], Engine]:
+    return lambda: PodmanEngine(config.podman_url, threads=1, timeout_s=CHECK_S - 1)
+
+
+def _open_session() -> Awaitable[Session]:
+    # As a gateway does, but on a port of the kernel's choice and linked to nobody.
+    return Session.open(PlaneConfig(listen=("tcp/127.0.0.1:0",), join_wait_s=0.0), "doctor")
+
+
+def local_checks(machine: Machine, config: GatewayConfig | None) -> list[Check]:
+    """Everything that is told without Podman or Zenoh."""
+    checks = [check_python(machine), check_user(machine), check_locale(machine), check_clock(machine)]
+    checks += check_programs(machine)
+    checks += check_ids(machine)
+    checks += [check_runtime_dir(machine), check_storage(machine)]
+    folders = [machine.home]
+    if config is not None:
+        folders += [Path(config.data_dir).expanduser(), config.record.folder]
+        checks += check_ports(machine, config)
+    checks += check_disk(machine, folders)
+    checks.append(check_model(machine, config.llm.local_model if config else ""))
+    return checks
+
+
+async def _bounded(name: str, checking: Awaitable[list[Check]]) -> list[Check]:
+    try:
+        async with asyncio.timeout(CHECK_S):
+            return await checking
+    except TimeoutError:
+        return [
+            Check(name=name, ok=False, detail=f"no answer within {CHECK_S:.0f} s", remedy="see its log and the load")
+        ]
+
+
+async def run_checks(
+    config: GatewayConfig | None = None,
+    *,
+    machine: Machine | None = None,
+    make_engine: Callable[[], Engine] | None = None,
+    open_session: Callable[[], Awaitable[Session]] | None = None,
+) -> tuple[Check, ...]:
+    """Check every prerequisite of a gateway here.
+
+    Args:
+        config: a gateway's configuration, to check its ports and folders too.
+        machine: the machine; tests give another.
+        make_engine: opens Podman.
+        open_session: opens a Zenoh session.
+    """
+    here = machine or ThisMachine()
+    pool = config.pool if config else PoolConfig()
+    catalogue = load_catalogue(tuple(Path(each).expanduser() for each in config.skills) if config else ())
+
+    async def session() -> list[Check]:
+        return [await check_session(open_session or _open_session)]
+
+    checks = await asyncio.to_thread(local_checks, here, config)
+    checks += await _bounded("podman api", check_podman(make_engine or _open_engine(pool), catalogue, pool))
+    checks += await _bounded("zenoh", session())
+    return tuple(checks)
