@@ -1,7 +1,8 @@
 """Moves a robot: asks where it is, plans, sends the way, waits for arrival. Shared by all skills that go somewhere.
 
-The calls are made in the same order and number each time (state, take-off or state again, goto), because a
-call's number is part of the command's identity: a repeated attempt must meet its own earlier goto, nothing else.
+The calls are the same each time (state, then goto), because a call's number is part of the command's identity: a
+repeated attempt must meet its own earlier goto, nothing else. A robot that flies takes off by itself when it is sent
+somewhere from the ground.
 """
 
 from collections.abc import Sequence
@@ -11,9 +12,8 @@ from . import params, paths
 from .context import Context
 from .places import Spot
 
-CRUISE_M = 5.0
-"""Height a robot that flies climbs to when it is sent somewhere from the ground."""
 AIRBORNE_M = 0.5
+"""Below this a robot that flies is on the ground, and a place is one on the ground, metres."""
 SLOWEST_MPS = 0.3
 """What the time allowed for a way is reckoned with: a slow robot is not a lost one."""
 MAX_WAYPOINTS = 100
@@ -21,13 +21,12 @@ MAX_WAYPOINTS = 100
 
 
 class State(NamedTuple):
-    """Where the robot is and what it can."""
+    """Where the robot is, metres, and whether it flies."""
 
     x: float
     y: float
     z: float
     flies: bool
-    verbs: tuple[str, ...]
 
 
 def state(ctx: Context) -> State:
@@ -43,7 +42,6 @@ def state(ctx: Context) -> State:
         float(pose.get("y", 0.0)),
         float(pose.get("z", 0.0)),
         bool(info.get("flies", False)),
-        tuple(info.get("verbs") or ()),
     )
 
 
@@ -91,7 +89,7 @@ def go(
         `pose` at the end, `path_m`, `waypoints`.
     """
     before = state(ctx)
-    altitude = _climb(ctx, before, goals)
+    altitude = _altitude(ctx, before, goals)
     here: paths.Point = (before.x, before.y)
     way: list[paths.Point] = []
     waypoints: list[dict[str, float]] = []
@@ -100,7 +98,8 @@ def go(
         if before.flies and goal.z > AIRBORNE_M:
             altitude = goal.z
         for x, y in leg:
-            waypoints.append({"x": round(x, 3), "y": round(y, 3)} | ({"z": round(altitude, 2)} if before.flies else {}))
+            height = {} if altitude is None else {"z": round(altitude, 2)}
+            waypoints.append({"x": round(x, 3), "y": round(y, 3)} | height)
         way += leg
     if len(waypoints) > MAX_WAYPOINTS:
         raise ctx.Fail(f"the way has {len(waypoints)} turns, {MAX_WAYPOINTS} are possible", "go in several steps")
@@ -115,18 +114,12 @@ def go(
     return {"pose": end, "path_m": round(metres, 2), "waypoints": waypoints}
 
 
-def _climb(ctx: Context, before: State, goals: Sequence[Spot]) -> float:
-    """See that a robot that flies is in the air; return the height to fly at."""
+def _altitude(ctx: Context, before: State, goals: Sequence[Spot]) -> float | None:
+    """Return the height to fly at, None where the robot is to choose: it drives, or takes off first."""
     limit = float(ctx.site.get("altitude_limit_m", 60.0))
     for goal in goals:
         if goal.z > limit:
             raise ctx.Fail(f"{goal.name} is {goal.z:g} m up, the site allows {limit:g} m", "choose a lower place")
         if goal.z > AIRBORNE_M and not before.flies:
             raise ctx.Fail(f"{goal.name} is {goal.z:g} m up and {ctx.robot} does not fly", "send a robot that flies")
-    altitude = min(before.z if before.z > AIRBORNE_M else CRUISE_M, limit)
-    if before.flies and before.z <= AIRBORNE_M and "takeoff" in before.verbs:
-        ctx.progress(0.02, f"climbing to {altitude:g} m")
-        ctx.command("takeoff", timeout_s=90, altitude_m=altitude)
-    elif before.flies:
-        state(ctx)  # keeps the number of calls: see above
-    return altitude
+    return min(before.z, limit) if before.flies and before.z > AIRBORNE_M else None

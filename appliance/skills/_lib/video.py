@@ -19,4 +19,5 @@ def ffmpeg(ctx: Context, arguments: Sequence[str | Path], *, what: str, timeout_
         raise ctx.Fail(f"{what} took longer than {timeout_s:g} s", "make it shorter", retryable=True) from error
     if done.returncode != 0:
         words = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        raise ctx.Fail(f"{what} failed: {' / '.join(words[-3:])[:500] or f'ffmpeg ended with {done.returncode}'}")
+        told = " / ".join(words[-3:])[:500] or f"ffmpeg ended with {done.returncode}"
+        raise ctx.Fail(f"{what} failed: {told}", "look whether what it was made from is whole")

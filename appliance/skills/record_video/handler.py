@@ -23,19 +23,37 @@ def run(ctx: Context) -> dict[str, Any]:
         seconds = min(PIECE_S, lasting - piece * PIECE_S)
         ctx.progress(0.9 * piece / pieces, f"recording {target}: {piece * PIECE_S:g} of {lasting:g} s")
         answer = ctx.command("record", timeout_s=60 + seconds, target=target, duration_s=seconds, fps=FPS)
-        blobs: dict[str, bytes] = answer.get("blobs") or {}
-        for name in sorted(blobs):
-            (ctx.scratch / f"frame-{count:05d}.jpg").write_bytes(blobs[name])
-            count += 1
+        count += _encode(ctx, piece, answer.get("blobs") or {})
     if count == 0:
         raise ctx.Fail(f"{ctx.robot} recorded no frame of {target}", "look at its camera", retryable=True)
-    ctx.progress(0.9, f"encoding {count} frames")
-    # H.264 wants even sides; every player takes yuv420p.
-    even = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
-    picture = ["-vf", even, "-pix_fmt", "yuv420p", "-c:v", "libx264", "-preset", "veryfast", "-threads", "1"]
-    source = ["-framerate", f"{FPS:g}", "-i", "frame-%05d.jpg"]
-    ffmpeg(ctx, [*source, *picture, "-movflags", "+faststart", "video.mp4"], what="encoding the video")
+    ctx.progress(0.95, f"joining {count} frames")
+    _join(ctx)
     data = (ctx.scratch / "video.mp4").read_bytes()
     video = ctx.put_artifact(f"{params.slug(target)}.mp4", data, "video/mp4")
     ctx.progress(1.0, f"{count} frames, {len(data):,} bytes")
     return {"video": video, "target": target, "duration_s": lasting, "fps": FPS, "frames_recorded": count}
+
+
+def _encode(ctx: Context, piece: int, blobs: dict[str, bytes]) -> int:
+    """Encode the frames of one piece, so that they need not wait in memory for the others; return their number."""
+    if not blobs:
+        return 0
+    frames = [ctx.scratch / f"frame-{number:03d}.jpg" for number in range(len(blobs))]
+    for file, name in zip(frames, sorted(blobs), strict=True):
+        file.write_bytes(blobs[name])
+    # H.264 wants even sides; every player takes yuv420p.
+    picture = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+    coder = ["-c:v", "libx264", "-preset", "veryfast", "-threads", "1"]
+    source = ["-framerate", f"{FPS:g}", "-i", "frame-%03d.jpg"]
+    ffmpeg(ctx, [*source, *picture, *coder, f"piece-{piece:03d}.mp4"], what="encoding the video")
+    for file in frames:
+        file.unlink()
+    return len(frames)
+
+
+def _join(ctx: Context) -> None:
+    """Put the pieces into one file, index first, without encoding them again."""
+    pieces = sorted(each.name for each in ctx.scratch.glob("piece-*.mp4"))
+    (ctx.scratch / "pieces.txt").write_text("".join(f"file '{name}'\n" for name in pieces), encoding="ascii")
+    joined = ["-f", "concat", "-i", "pieces.txt", "-c", "copy", "-movflags", "+faststart", "video.mp4"]
+    ffmpeg(ctx, joined, what="joining the video")

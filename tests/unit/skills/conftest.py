@@ -65,9 +65,6 @@ class FakeContext:
             case "goto":
                 self.info["pose"] = dict(args["waypoints"][-1])
                 return {"pose": dict(args["waypoints"][-1])}
-            case "takeoff":
-                self.info["pose"] = {**self.info["pose"], "z": args["altitude_m"]}
-                return {}
             case "capture":
                 return {"blobs": {"image.png": self.picture}, "width": 320}
             case "record":

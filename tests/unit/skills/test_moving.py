@@ -46,18 +46,15 @@ def test_goto_keeps_to_the_speed_limit(make_ctx: Make, handler: Load) -> None:
     assert slow.sent("goto")[0]["speed_mps"] == 0.5
 
 
-def test_goto_takes_a_flyer_into_the_air_first(make_ctx: Make, handler: Load) -> None:
-    """A robot that flies and stands climbs first; one in the air keeps its height; calls keep their numbers."""
-    ctx = make_ctx(place="dock 1")
-    ctx.info |= {"flies": True, "verbs": ["state", "goto", "takeoff"], "pose": {"x": 6.0, "y": 25.0}}
-    handler("goto").run(ctx)
-    assert verbs(ctx) == ["state", "takeoff", "goto"]
-    assert {point["z"] for point in ctx.sent("goto")[0]["waypoints"]} == {5.0}
-    again = make_ctx(place="dock 2")
-    again.info |= {"flies": True, "verbs": ["state", "goto", "takeoff"], "pose": {"x": 6.0, "y": 25.0, "z": 80.0}}
-    handler("goto").run(again)
-    assert verbs(again) == ["state", "state", "goto"]
-    assert {point["z"] for point in again.sent("goto")[0]["waypoints"]} == {30.0}, "held to the site's altitude limit"
+def test_goto_keeps_a_flyer_s_height(make_ctx: Make, handler: Load) -> None:
+    """In the air it keeps its height within the site's limit; from the ground the robot chooses; a high goal counts."""
+    for height, place, wanted in ((8.0, "dock 2", {8.0}), (80.0, "dock 2", {30.0}), (0.0, "dock 2", {None}),
+                                  (8.0, "(36, 18, 12)", {12.0})):  # fmt: skip
+        ctx = make_ctx(place=place)
+        ctx.info |= {"flies": True, "pose": {"x": 6.0, "y": 25.0, "z": height}}
+        handler("goto").run(ctx)
+        assert verbs(ctx) == ["state", "goto"]
+        assert {point.get("z") for point in ctx.sent("goto")[0]["waypoints"]} == wanted
 
 
 def test_goto_never_enters_the_forbidden_area(make_ctx: Make, handler: Load) -> None:

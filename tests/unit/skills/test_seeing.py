@@ -224,6 +224,9 @@ def test_find_gives_up_with_a_reason(make_ctx: Make, handler: Load) -> None:
     with pytest.raises(ctx.Fail, match="was not seen from 4 points"):
         handler("find").run(ctx)
     assert len(ctx.sent("capture")) == 4, "the point to the north is in the rack"
+    verbs = [verb for verb, _ in ctx.commands]
+    view = ["state", "goto", "capture"]
+    assert verbs == ["state", "capture", "state", "state", "state", *view, *view, *view], "numbers are kept"
 
 
 def test_track_follows_and_counts_losses(make_ctx: Make, handler: Load, picture: Draw) -> None:
