@@ -437,7 +437,9 @@ class Driver:
                 self._ready_ns[each.subtask.id] = time.monotonic_ns()
 
     async def _flush(self) -> None:
-        """Write the record, then publish what led to it and send the orders that follow; SupersededError if it moved on.
+        """Write the record, then publish what led to it and send the orders that follow.
+
+        Raises SupersededError when the record has moved on.
 
         One write covers all transitions since the last: a finished subtask and the dispatch of its successors
         become durable together, which takes a replicated write off the successors' start.

@@ -113,18 +113,18 @@ class Executor:
             phase=phase,
         )
         self._remember(run_id, begun)
-        task = asyncio.create_task(self._carry_out(request, decision, phase, received_ns), name=f"run {run_id}")
+        task = asyncio.create_task(self._carry_out(request, decision, received_ns), name=f"run {run_id}")
         self._running[run_id] = task
         task.add_done_callback(lambda _: self._ended(run_id))
         self.on_change()
         return accepted
 
-    async def _carry_out(self, request: RunRequest, decision: Decision, phase: Phase, received_ns: int) -> None:
+    async def _carry_out(self, request: RunRequest, decision: Decision, received_ns: int) -> None:
         run_id = request.run_id
         waited_ms = (time.monotonic_ns() - received_ns) / 1e6
 
         def tell(event: RunEvent) -> None:
-            told = replace(event, gateway=self._plane.gateway, phase=phase)
+            told = replace(event, gateway=self._plane.gateway, phase=_seen_from_afar(event.phase, request))
             if told.kind is RunEventKind.STARTED and told.startup_ms is not None:
                 told = replace(told, startup_ms=told.startup_ms + waited_ms)
             if told.kind is RunEventKind.STARTED:
@@ -143,7 +143,7 @@ class Executor:
             final = _failed(
                 request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
             )
-        final = replace(final, gateway=self._plane.gateway, phase=phase)
+        final = replace(final, gateway=self._plane.gateway, phase=_seen_from_afar(final.phase, request))
         self._remember(run_id, final)
         await begun
         # Kept before it is told: a coordinator that misses the event finds it here.
@@ -208,6 +208,11 @@ class Executor:
             await self._pool.cancel(run_id)
         if self._running:
             await asyncio.wait(list(self._running.values()), timeout=5.0)
+
+
+def _seen_from_afar(phase: Phase | None, request: RunRequest) -> Phase | None:
+    """The phase as the gateway that was asked first sees it: what is local to us is remote to it."""
+    return Phase.REMOTE_WARM if request.hops and phase is Phase.LOCAL_WARM else phase
 
 
 def _failed(request: RunRequest, failure: Failure) -> RunEvent:
