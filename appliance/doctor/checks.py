@@ -149,7 +149,7 @@ def check_runtime_dir(machine: Machine) -> Check:
         name="XDG_RUNTIME_DIR",
         ok=False,
         detail=detail,
-        remedy=f"loginctl enable-linger {machine.user}; without systemd: {SETUP} (it makes /run/user/{machine.uid}, mode 0700)",
+        remedy=f"loginctl enable-linger {machine.user}; without systemd {SETUP}, which makes /run/user/{machine.uid}",
     )
 
 
@@ -239,7 +239,7 @@ def podman_checks(facts: EngineFacts) -> Iterator[Check]:
         name="storage",
         ok=facts.storage_driver == "overlay",
         detail=facts.storage_driver,
-        remedy='write driver = "overlay" into ~/.config/containers/storage.conf, then podman system reset (removes images)',
+        remedy='driver = "overlay" in ~/.config/containers/storage.conf, then podman system reset (removes images)',
     )
     missing = ", ".join(sorted(LIMITING - facts.controllers))
     yield Check(
@@ -249,7 +249,7 @@ def podman_checks(facts: EngineFacts) -> Iterator[Check]:
         if facts.limits_enforced
         else f"cgroup {facts.cgroup_version}: containers' memory, CPU and processes are not limited"
         + (f" ({missing} not delegated)" if facts.cgroup_version == "v2" else ""),
-        remedy="boot with cgroup v2, and delegate cpu, memory and pids to users (user@.service.d, see docs/operations.md)",
+        remedy="boot with cgroup v2; delegate cpu, memory and pids to users (docs/operations.md)",
         required=False,
     )
 
@@ -303,7 +303,7 @@ async def check_container(engine: Engine, image: str, runtime: str) -> Check:
             ok=False,
             detail=error.message,
             remedy=error.remedy
-            or "read the message; with 'cgroup' in it set pool.runtime to runc, with 'overlay' see storage",
+            or 'cgroups: runtime = "runc" in ~/.config/containers/containers.conf; overlay: see storage',
         )
     return Check(name="container", ok=True, detail=f"starts{f' with {runtime}' if runtime else ''}")
 
@@ -381,6 +381,10 @@ def local_checks(machine: Machine, config: GatewayConfig | None) -> list[Check]:
     return checks
 
 
+def _catalogue(config: GatewayConfig | None) -> Catalogue:
+    return load_catalogue(tuple(Path(each).expanduser() for each in config.skills) if config else ())
+
+
 async def _bounded(name: str, checking: Awaitable[list[Check]]) -> list[Check]:
     try:
         async with asyncio.timeout(CHECK_S):
@@ -408,7 +412,7 @@ async def run_checks(
     """
     here = machine or ThisMachine()
     pool = config.pool if config else PoolConfig()
-    catalogue = load_catalogue(tuple(Path(each).expanduser() for each in config.skills) if config else ())
+    catalogue = await asyncio.to_thread(_catalogue, config)
 
     async def session() -> list[Check]:
         return [await check_session(open_session or _open_session)]

@@ -27,7 +27,7 @@ _TIMEX_BYTES = 256
 
 
 class FileFacts(Struct, frozen=True, kw_only=True):
-    """Who owns a file, its permission bits, and whether this process may write it. `privileged`: setuid or capabilities."""
+    """Who owns a file, its permission bits, whether we may write it; `privileged`: setuid root or capabilities."""
 
     owner: int
     mode: int
@@ -38,13 +38,35 @@ class FileFacts(Struct, frozen=True, kw_only=True):
 class Machine(Protocol):
     """The machine as the checks see it."""
 
-    python: tuple[int, ...]
-    uid: int
-    user: str
-    home: Path
-    environ: Mapping[str, str]
-    encoding: str
-    """Of text to and from the terminal."""
+    @property
+    def python(self) -> tuple[int, ...]:
+        """Version of Python."""
+        ...
+
+    @property
+    def uid(self) -> int:
+        """Whose process this is."""
+        ...
+
+    @property
+    def user(self) -> str:
+        """That user's name."""
+        ...
+
+    @property
+    def home(self) -> Path:
+        """That user's home."""
+        ...
+
+    @property
+    def environ(self) -> Mapping[str, str]:
+        """The environment."""
+        ...
+
+    @property
+    def encoding(self) -> str:
+        """Of text to and from the terminal."""
+        ...
 
     def which(self, program: str) -> str | None:
         """Return a program's path, None when it is not installed."""
