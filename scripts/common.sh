@@ -11,7 +11,7 @@ SERVICE_USER=swiftbot
 if [ "$(id -u)" -eq 0 ]; then
   AS_ROOT=1
   RUN_USER=$SERVICE_USER
-  BASE=$(getent passwd "$RUN_USER" | cut -d: -f6)
+  BASE=$(getent passwd "$RUN_USER" | cut -d: -f6) || true
   BASE=${BASE:-/var/lib/swiftbot}
   USER_HOME=$BASE
   VENV=$BASE/venv
