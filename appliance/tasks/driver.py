@@ -446,8 +446,13 @@ class Driver:
         """
         if self._dirty:
             try:
+                # Every write survives the death of processes. Only an end is synced to disk: what a power cut of
+                # the whole site takes from the middle of a task is done again under the same effect ids.
                 self._version = await self._plane.dht.write(
-                    task_key(self.record.id), encode(self.record), expected=self._version
+                    task_key(self.record.id),
+                    encode(self.record),
+                    expected=self._version,
+                    durable=self.record.state.final,
                 )
             except ConflictError:
                 await self._reread()

@@ -131,7 +131,7 @@ class Executor:
                 self._last[run_id] = told
             self._publish(told)
 
-        begun = asyncio.create_task(self._plane.store.put(f"run/{run_id}", encode(self._last[run_id])))
+        begun = asyncio.create_task(self._plane.store.put(f"run/{run_id}", encode(self._last[run_id]), durable=False))
         try:
             final = await self._pool.run(request, decision, tell)
         except SwiftbotError as error:
@@ -147,7 +147,7 @@ class Executor:
         self._remember(run_id, final)
         await begun
         # Kept before it is told: a coordinator that misses the event finds it here.
-        await self._plane.store.put(f"run/{run_id}", encode(final))
+        await self._plane.store.put(f"run/{run_id}", encode(final), durable=False)
         self._publish(final)
 
     def _publish(self, event: RunEvent) -> None:
