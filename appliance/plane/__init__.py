@@ -1,1 +1,7 @@
-"""The plane: Zenoh session, key space, membership, ring, replicated records and registry; knows nothing of tasks."""
+"""The plane: Zenoh session, key space, membership, ring, replicated records and registry; knows nothing of tasks.
+
+Doors: `node.Plane` (a gateway's part in the fleet) and `node.PlaneClient` (everybody else's), which put together
+`session.Session` (put, subscribe, query, serve, liveliness), `rpc.Rpc`, `dht.Dht` (records with compare-and-set),
+`registry.Registry` (the latest facts), `store.Store` (what must not be forgotten). `keys` alone knows key names;
+`ring` and `versions` decide without I/O. docs/keyspace.md describes every key.
+"""

@@ -9,7 +9,7 @@ the membership differ for a moment, or a partition) make concurrent versions, wh
 import asyncio
 import contextlib
 import uuid
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Callable, Coroutine
 from functools import partial
 from typing import Any
 
@@ -221,7 +221,9 @@ class Dht:
             self._later(self._push_again(gateway, record.key))
             return None
         except SwiftbotError as error:
-            log.error("a replica cannot store", replica=gateway, key=record.key, reason=str(error))
+            log.error(  # noqa: TRY400 - the replica's own reason says more than our traceback
+                "a replica cannot store", replica=gateway, key=record.key, reason=str(error)
+            )
             return None
         return answer.record
 

@@ -50,7 +50,7 @@ class Keys:
         return f"{self.root}/gw/{gateway}/rpc/{verb}"
 
     def exchange(self, gateway: str = "*", verb: str = "*") -> str:
-        """Put by the answering gateway: what was asked over RPC and what was answered (queries are not subscribable)."""
+        """Put by the answering gateway: what was asked over RPC and answered (queries cannot be subscribed to)."""
         return f"{self.root}/gw/{gateway}/exchange/{verb}"
 
     def log(self, gateway: str = "*") -> str:
@@ -98,6 +98,15 @@ class Keys:
     def intake(self, robot: str = "*") -> str:
         """Put by a robot: TaskRequest."""
         return f"{self.root}/robot/{robot}/task"
+
+    # the simulated world, shared by the simulated robots of a site
+    def world(self, thing: str = "*") -> str:
+        """Put by a simulated robot: a thing that it picked up or put down (robots/sim/world.Thing)."""
+        return f"{self.root}/world/{thing}"
+
+    def world_of(self, robot: str = "*") -> str:
+        """Queryable of a simulated robot: all things as it knows them, for those that come later."""
+        return f"{self.root}/robot/{robot}/world"
 
     # people
     def notice(self, to: str = "*") -> str:

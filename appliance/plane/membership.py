@@ -50,7 +50,7 @@ class Membership:
         if self._gateway is not None:
             self._token = self._session.declare_alive(self._session.keys.alive(self._gateway))
 
-    def _seen(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's callback signature
+    def _seen(self, key: str, alive: bool) -> None:
         name = key.split("/")[-2]
         if name == self._gateway or alive == (name in self._members):
             return
@@ -66,7 +66,10 @@ class Membership:
         self.ring = Ring(self._members, virtual_nodes=self._virtual_nodes)
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
         for callback in tuple(self.on_joined if alive else self.on_lost):
-            callback(name)
+            try:
+                callback(name)
+            except Exception:  # supervision boundary: the other listeners must hear of it all the same
+                log.exception("a listener to the membership failed", member=name)
 
     def close(self) -> None:
         """Leave: the token is taken back first, so the others take over before this gateway stops answering."""

@@ -91,7 +91,7 @@ class Plane:
         """Wait a moment for the first link: only then is it known who is there already."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.config.join_wait_s):
-                while not self.session.linked:
+                while not self.session.linked:  # noqa: ASYNC110 - the library has no event for it
                     await asyncio.sleep(0.005)
 
     async def _taken(self) -> bool:
@@ -142,7 +142,7 @@ class PlaneClient:
 
     @classmethod
     async def open(cls, config: PlaneConfig, *, fleet: str) -> "PlaneClient":
-        """Connect; the facts that are there come in within milliseconds.
+        """Connect, and learn who is there and what they know.
 
         Raises:
             ConfigError: a setting is wrong.
@@ -150,8 +150,15 @@ class PlaneClient:
         """
         client = cls(config, session=await Session.open(config, fleet))
         client._membership.on_joined.append(lambda _: client._came.set())
-        client._membership.start()
-        client.registry.start()
+        try:
+            client.registry.start()
+            client._membership.start()
+            for key in await client.session.alive_now(client.keys.alive()):
+                client._membership.add(key.split("/")[-2])
+            await client.registry.wait_for_facts()
+        except BaseException:
+            await client.close()
+            raise
         return client
 
     def members(self) -> frozenset[str]:

@@ -7,6 +7,7 @@ and repair. Copies that belong elsewhere are handed over, and dropped when every
 """
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -108,18 +109,16 @@ class Reconciler:
         settled: Ring | None = None
         wait_s = 0.0
         while True:
-            try:
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
                     await self._changed.wait()
-            except TimeoutError:
-                pass
             self._changed.clear()
             ring = self._membership.ring
             try:
-                complete = await self._round(ring)
+                complete, fetched = await self._round(ring)
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
-                complete = False
+                complete, fetched = False, 0
             wait_s = self._config.anti_entropy_s if complete else _AGAIN_S
             if ring != self._membership.ring:
                 wait_s = 0.0
@@ -127,6 +126,9 @@ class Reconciler:
             if ring != settled:
                 settled = ring
                 await self._dht.settled(ring)
+                self._tell(self._dht.on_ring_change)
+            elif fetched:
+                # A member that could not be asked when the ring changed was heard only now: same news.
                 self._tell(self._dht.on_ring_change)
 
     def _tell(self, callbacks: list[Callable[[], None]]) -> None:
@@ -136,13 +138,14 @@ class Reconciler:
             except Exception:  # supervision boundary: one listener's defect must not stop the repair
                 log.exception("a listener to the ring failed")
 
-    async def _round(self, ring: Ring) -> bool:
-        """Compare with every other member; False when one could not be asked."""
+    async def _round(self, ring: Ring) -> tuple[bool, int]:
+        """Compare with every other member; returns whether all could be asked, and how many records came in."""
         results = await asyncio.gather(*(self._pull(each, ring) for each in sorted(ring.members - {self._gateway})))
         handed = await self._hand_over(ring)
         before_ns = time.time_ns() - int(self._config.tombstone_hours * 3.6e12)
         await self._store.forget_tombstones(before_ns)
-        return all(results) and handed
+        complete = handed and all(fetched is not None for fetched in results)
+        return complete, sum(fetched or 0 for fetched in results)
 
     async def join(self) -> None:
         """Fetch what this gateway will own before it shows itself, so that its first requests wait less."""
@@ -151,17 +154,18 @@ class Reconciler:
 
     # --- fetching ---------------------------------------------------------------------------------------------
 
-    async def _pull(self, member: str, ring: Ring, *, joining: bool = False) -> bool:
+    async def _pull(self, member: str, ring: Ring, *, joining: bool = False) -> int | None:
+        """Fetch what a member has and this gateway lacks; returns how many records, None when it did not answer."""
         try:
             fetched = await self._pull_from(member, ring, joining=joining)
         except SwiftbotError as error:
             if member in self._membership.members:
                 log.warning("could not compare with a member", member=member, reason=str(error))
-                return False
-            return True
+                return None
+            return 0
         if fetched:
             log.info("fetched records", member=member, records=fetched)
-        return True
+        return fetched
 
     async def _pull_from(self, member: str, ring: Ring, *, joining: bool) -> int:
         mine = dict(await self._store.digests())

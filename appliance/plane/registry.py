@@ -133,6 +133,11 @@ class Registry:
 
     # --- others' facts ----------------------------------------------------------------------------------------
 
+    async def wait_for_facts(self) -> None:
+        """Wait until every member that is known has told its facts, or could not within a few seconds."""
+        if self._asking:
+            await asyncio.wait(self._asking.values())
+
     def _on_status(self, key: str, status: GatewayStatus | None) -> None:
         gateway = key.split("/")[-2]
         if gateway == self._gateway or status is None or not self._is_member(gateway):
@@ -145,7 +150,7 @@ class Registry:
         self._tell("gateway")
 
     def _on_container(self, key: str, info: ContainerInfo | None) -> None:
-        gateway, container = key.split("/")[-3], key.split("/")[-1]
+        gateway, container = key.split("/")[-3], key.rsplit("/", maxsplit=1)[-1]
         if gateway == self._gateway or not self._is_member(gateway):
             return
         held = self.containers.setdefault(gateway, {})
@@ -249,7 +254,7 @@ class Registry:
         if before != info:
             self._tell("robot")
 
-    def _on_robot_alive(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's callback signature
+    def _on_robot_alive(self, key: str, alive: bool) -> None:
         if not alive:
             self._lose(key.split("/")[-2])
 
@@ -271,7 +276,10 @@ class Registry:
 
     def _tell(self, kind: str) -> None:
         for callback in tuple(self.on_change):
-            callback(kind)
+            try:
+                callback(kind)
+            except Exception:  # supervision boundary: a listener's defect must not stop the facts
+                log.exception("a listener to the facts failed", kind=kind)
 
     async def close(self) -> None:
         """Publish what waits, listen no more."""

@@ -53,7 +53,7 @@ class Rpc:
     def register(
         self, verb: str, request: type[Q], handler: Callable[[Q], Awaitable[Struct]], *, exchange: bool = True
     ) -> None:
-        """Answer a verb. `exchange=False` is for the plane's own traffic, which would only repeat what is put anyway."""
+        """Answer a verb. `exchange=False` is for the plane's own traffic, which would repeat what is put anyway."""
         gateway = self._gateway
         if gateway is None or verb in self._verbs:
             raise ConfigError(f"the verb {verb} cannot be served here")
@@ -72,31 +72,29 @@ class Rpc:
             if not exchange:
                 return await answer(payload)
             began = time.monotonic()
-            reply: bytes | None = None
-            failure: ErrorReply | None = None
             try:
                 reply = await answer(payload)
-                return reply
-            except SwiftbotError as error:
-                failure = ErrorReply(code=error.code, message=error.message, remedy=error.remedy)
-                raise
             except Exception as error:
-                failure = ErrorReply(code="internal", message=f"{type(error).__name__}: {error}")
+                self._publish(verb, gateway, payload, began, error)
                 raise
-            finally:
-                record = Exchange(
-                    verb=verb,
-                    gateway=gateway,
-                    request=_shown(payload, checked=failure is None),
-                    reply=None if reply is None else _shown(reply, checked=True),
-                    error=failure,
-                    duration_ms=round((time.monotonic() - began) * 1e3, 3),
-                )
-                self._session.put(self._session.keys.exchange(gateway, verb), encode(record))
+            self._publish(verb, gateway, payload, began, reply)
+            return reply
 
         self._verbs[verb] = serve
         key = self._session.keys.rpc(gateway, verb)
         self._closers.append(self._session.serve(key, lambda _, payload: serve(payload)))
+
+    def _publish(self, verb: str, gateway: str, payload: bytes, began: float, outcome: bytes | Exception) -> None:
+        reply, error = (outcome, None) if isinstance(outcome, bytes) else (None, _failure(outcome))
+        record = Exchange(
+            verb=verb,
+            gateway=gateway,
+            request=_shown(payload, checked=error is None),
+            reply=None if reply is None else _shown(reply, checked=True),
+            error=error,
+            duration_ms=round((time.monotonic() - began) * 1e3, 3),
+        )
+        self._session.put(self._session.keys.exchange(gateway, verb), encode(record))
 
     async def call(self, gateway: str, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0) -> R:
         """Ask a gateway; errors are those of `Session.query`, and PayloadError when the answer is no `reply`."""
@@ -112,6 +110,12 @@ class Rpc:
         """Answer no more."""
         for closer in self._closers:
             closer.close()
+
+
+def _failure(error: Exception) -> ErrorReply:
+    if isinstance(error, SwiftbotError):
+        return ErrorReply(code=error.code, message=error.message, remedy=error.remedy)
+    return ErrorReply(code="internal", message=f"{type(error).__name__}: {error}")
 
 
 def _shown(payload: bytes, *, checked: bool) -> Raw:

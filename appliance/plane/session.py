@@ -5,13 +5,14 @@ bounded, and one that is malformed or oversize is counted, logged and dropped or
 Nothing that is sent can hang the loop: sends block when a peer is stuck (dropping would lose facts silently), but
 they do so on a thread of their own, and a peer stuck for a lease is disconnected.
 """
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
 
 import asyncio
 import contextlib
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -20,16 +21,8 @@ import zenoh
 from msgspec import Struct
 from zenoh.handlers import Callback
 
-from appliance.errors import (
-    ConfigError,
-    DeadlineError,
-    PayloadError,
-    RefusedError,
-    SwiftbotError,
-    UnreachableError,
-    from_code,
-)
-from appliance.model import ErrorReply, encode
+from appliance.errors import DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane import link
 from appliance.plane.keys import Keys
 from appliance.plane.queues import Inbox, Outbox
 from appliance.plane.settings import PlaneConfig
@@ -40,8 +33,6 @@ T = TypeVar("T")
 
 _CLOSE_S = 2.0
 """How long a closing session keeps sending what waits."""
-_WIRE_HEADROOM = 8
-"""Zenoh itself drops messages of more than so many times the largest payload, before they are whole in memory."""
 
 
 class Message(Struct, frozen=True):
@@ -59,6 +50,11 @@ class Closer:
 
     def __init__(self, end: Callable[[], None]) -> None:
         self._end: Callable[[], None] | None = end
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was ended; what was under way to the loop then is not delivered any more."""
+        return self._end is None
 
     def close(self) -> None:
         """End it."""
@@ -81,6 +77,7 @@ class Session:
         self._inbox = Inbox(loop, messages=config.queue_messages, payload_bytes=config.queue_bytes)
         self._outbox = Outbox(messages=config.queue_messages, payload_bytes=config.queue_bytes)
         self._answering: set[asyncio.Task[None]] = set()
+        self._asking: set[asyncio.Future[bytes]] = set()
         self._closed = False
 
     @classmethod
@@ -93,10 +90,7 @@ class Session:
         """
         config.check()
         Keys(fleet)
-        try:
-            raw = await asyncio.to_thread(zenoh.open, _zenoh_config(config))
-        except zenoh.ZError as error:
-            raise _open_error(config, str(error)) from error
+        raw = await asyncio.to_thread(link.open_raw, config)
         return cls(config, fleet, raw, asyncio.get_running_loop())
 
     @property
@@ -122,7 +116,6 @@ class Session:
             payload,
             encoding=encoding,
             congestion_control=zenoh.CongestionControl.BLOCK,
-            express=True,
         )
         self._send(key, send, len(payload))
 
@@ -131,7 +124,7 @@ class Session:
         self._send(key, partial(self._raw.delete, key, congestion_control=zenoh.CongestionControl.BLOCK), 0)
 
     def _send(self, key: str, send: Callable[[], None], size: int) -> None:
-        if not self._outbox.send(partial(_quietly, send, key), size) and not self._closed:
+        if not self._outbox.send(partial(link.quietly, send, key), size) and not self._closed:
             self.refuse("outgoing queue full", key=key)
 
     def subscribe(self, expr: str, callback: Callable[[Message], None]) -> Closer:
@@ -151,10 +144,15 @@ class Session:
                 stamp.get_time_as_ntp64().as_nanos() if stamp else time.time_ns(),
                 str(sample.encoding),
             )
-            self._inbox.post(partial(callback, message), size)
+            self._inbox.post(partial(deliver, message), size)
+
+        def deliver(message: Message) -> None:
+            if not closer.closed:
+                callback(message)
 
         subscriber = self._raw.declare_subscriber(expr, Callback(take, indirect=False))
-        return Closer(subscriber.undeclare)
+        closer = Closer(subscriber.undeclare)
+        return closer
 
     def subscribe_typed(self, expr: str, kind: type[T], callback: Callable[[str, T | None], None]) -> Closer:
         """Have facts delivered decoded, None when one is deleted; malformed ones are counted, logged, dropped."""
@@ -194,7 +192,7 @@ class Session:
                 data = payload.to_bytes() if payload is not None else b""
                 begin = partial(answer, key, data, query)
             if not self._inbox.post(begin, size):
-                _reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
+                link.reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
 
         def answer(key: str, data: bytes, query: zenoh.Query) -> None:
             if len(running) >= self.config.concurrent_queries:
@@ -231,13 +229,13 @@ class Session:
         finally:
             size = len(reply) if reply is not None and error is None else 0
             if self._closed:
-                _reply(query, expr, reply, error)
+                link.reply(query, expr, reply, error)
             else:
-                self._send(key, partial(_reply, query, expr, reply, error), size)
+                self._send(key, partial(link.reply, query, expr, reply, error), size)
 
     def _refuse_query(self, what: str, query: zenoh.Query, expr: str, error: SwiftbotError) -> None:
         self.refuse(what, key=str(query.key_expr), reason=str(error))
-        self._send(expr, partial(_reply, query, expr, None, error), 0)
+        self._send(expr, partial(link.reply, query, expr, None, error), 0)
 
     async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask whoever serves a key and return the first answer.
@@ -249,6 +247,7 @@ class Session:
             SwiftbotError: what the answering side raised.
         """
         answer: asyncio.Future[bytes] = self._loop.create_future()
+        self._asking.add(answer)
 
         def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
             if not answer.done():
@@ -263,13 +262,14 @@ class Session:
                     UnreachableError(f"nobody answers on {key}", remedy="is that gateway or robot up and linked?")
                 )
 
-        self._get(key, payload, timeout_s, on_reply, on_end, target=zenoh.QueryTarget.BEST_MATCHING)
         try:
+            self._get(key, payload, timeout_s, on_reply, on_end, target=zenoh.QueryTarget.BEST_MATCHING)
             async with asyncio.timeout(timeout_s):
                 return await answer
         except TimeoutError:
             raise DeadlineError(f"no answer on {key} within {timeout_s:g} s") from None
         finally:
+            self._asking.discard(answer)
             answer.cancel()
 
     async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
@@ -308,7 +308,7 @@ class Session:
         def take(reply: zenoh.Reply) -> None:
             sample = reply.ok
             if sample is None:
-                error = _error_of(reply.err)
+                error = link.error_of(reply.err)
                 self._inbox.post(partial(on_reply, expr, None, error), must=True)
             elif (size := len(sample.payload)) > limit:
                 self._inbox.post(partial(self.refuse, "oversize answer", key=expr, size=size))
@@ -321,7 +321,7 @@ class Session:
         send = partial(
             self._raw.get,
             expr,
-            Callback(take, drop=lambda: self._inbox.post(on_end, must=True) and None, indirect=False),
+            Callback(take, drop=partial(self._inbox.post, on_end, must=True), indirect=False),
             target=target,
             consolidation=zenoh.ConsolidationMode.NONE,
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
@@ -351,7 +351,7 @@ class Session:
         ask = partial(
             self._raw.liveliness().get,
             expr,
-            Callback(take, drop=lambda: self._inbox.post(ended.set, must=True) and None, indirect=False),
+            Callback(take, drop=partial(self._inbox.post, ended.set, must=True), indirect=False),
             timeout=timeout_s,
         )
         self._send(expr, cast("Callable[[], None]", ask), 0)
@@ -365,10 +365,16 @@ class Session:
 
         def take(sample: zenoh.Sample) -> None:
             alive = sample.kind == zenoh.SampleKind.PUT
-            self._inbox.post(partial(callback, str(sample.key_expr), alive), must=True)
+            self._inbox.post(partial(deliver, str(sample.key_expr), alive), must=True)
 
+        def deliver(key: str, alive: bool) -> None:
+            if not closer.closed:
+                callback(key, alive)
+
+        # What comes before `closer` is bound waits in the inbox: it is delivered by a later turn of the loop.
         subscriber = self._raw.liveliness().declare_subscriber(expr, Callback(take, indirect=False), history=True)
-        return Closer(subscriber.undeclare)
+        closer = Closer(subscriber.undeclare)
+        return closer
 
     # --- bad input, end ---------------------------------------------------------------------------------------
 
@@ -392,103 +398,9 @@ class Session:
         if self._answering:
             await asyncio.wait(self._answering, timeout=_CLOSE_S)
         self._closed = True
+        for answer in self._asking:
+            if not answer.done():
+                answer.set_exception(UnreachableError("the session was closed"))
         await asyncio.to_thread(self._outbox.close, _CLOSE_S)
         await asyncio.to_thread(self._raw.close)
         self._inbox.close()
-
-
-def _reply(query: zenoh.Query, expr: str, reply: bytes | None, error: SwiftbotError | None) -> None:
-    """Answer and end a query; the asking side may be gone, which is no concern of ours."""
-    key = str(query.key_expr) if "*" in expr else expr
-    with contextlib.suppress(zenoh.ZError), query:
-        if error is not None or reply is None:
-            error = error or SwiftbotError("no answer")
-            problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
-            body = ErrorReply(code=error.code, message=error.message, remedy=error.remedy, problems=problems)
-            query.reply_err(encode(body), encoding="application/json")
-        else:
-            query.reply(key, reply, encoding="application/json", express=True)
-
-
-def _quietly(send: Callable[[], None], key: str) -> None:
-    try:
-        send()
-    except zenoh.ZError as error:
-        log.warning("not sent", key=key, reason=str(error))
-
-
-def _error_of(error: zenoh.ReplyError | None) -> SwiftbotError:
-    text = error.payload.to_bytes()[:65_536] if error is not None else b""
-    if text == b"Timeout":  # Zenoh's own way of saying so
-        return DeadlineError("no answer in time")
-    try:
-        body = msgspec.json.decode(text, type=ErrorReply)
-    except (msgspec.DecodeError, UnicodeDecodeError):
-        return SwiftbotError(f"answered with an error that cannot be read: {text[:200]!r}")
-    rebuilt = from_code(body.code, body.message, body.remedy)
-    if body.problems and hasattr(rebuilt, "problems"):
-        rebuilt.problems = body.problems  # pyright: ignore[reportAttributeAccessIssue]
-    return rebuilt
-
-
-def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
-    """Zenoh's own configuration; design/platform has the measurements behind it."""
-    client = config.mode == "client"
-    settings: dict[str, Any] = {
-        "mode": config.mode,
-        "listen/endpoints": list(config.listen),
-        "listen/exit_on_failure": True,
-        "listen/timeout_ms": 0,
-        "connect/endpoints": list(config.connect),
-        # Peers look for each other for ever in the background, so gateways may start in any order.
-        "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
-        "connect/exit_on_failure": client,
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-        "scouting/delay": 0,
-        "timestamping/enabled": True,
-        "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": config.lease_ms,
-        "transport/link/tx/keep_alive": 4,
-        # A peer that takes nothing for a lease is as good as dead: its link is closed and the sender goes on.
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": config.lease_ms * 1000,
-        "transport/link/rx/max_message_size": config.max_payload_bytes * _WIRE_HEADROOM,
-        "transport/unicast/open_timeout": 3000,
-        "transport/unicast/accept_timeout": 3000,
-    }
-    made = zenoh.Config()
-    for key, value in settings.items():
-        made.insert_json5(key, msgspec.json.encode(value).decode())
-    return made
-
-
-def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
-    for endpoint in config.listen:
-        if f"bound to {endpoint}" in text or endpoint in text:
-            if "in use" in text:
-                return ConfigError(
-                    f"cannot listen on {endpoint}: the port is in use",
-                    remedy="another gateway may be running; stop it (`swiftbot down`) or change plane.listen",
-                )
-            if "assign requested address" in text:
-                return ConfigError(
-                    f"cannot listen on {endpoint}: this machine has no such address",
-                    remedy="set plane.listen to an address of this machine, or 0.0.0.0",
-                )
-            if "ermission denied" in text:
-                return ConfigError(f"cannot listen on {endpoint}: not permitted", remedy="use a port above 1023")
-            return ConfigError(f"cannot listen on {endpoint}: {_first(text)}", remedy="correct plane.listen")
-    if config.mode == "client":
-        return UnreachableError(
-            f"nothing answers at {', '.join(config.connect)}",
-            remedy="is the fleet up? try `swiftbot up` or `--connect`",
-        )
-    return ConfigError(
-        f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect"
-    )
-
-
-def _first(text: str) -> str:
-    """The message without the library's source locations."""
-    return text.partition(" at /")[0].replace(str(Path.home()), "~")

@@ -149,7 +149,7 @@ class Store:
 
     async def forget_tombstones(self, before_ns: int) -> None:
         """Drop removals older than that (Unix nanoseconds, this machine's clock)."""
-        await self._execute("DELETE FROM records WHERE deleted AND updated_ns < ?", before_ns)
+        await self._execute("DELETE FROM records WHERE deleted AND updated_ns < ?", before_ns, durable=False)
 
     # --- the thread -------------------------------------------------------------------------------------------
 
@@ -175,7 +175,7 @@ class Store:
     def _run(self) -> None:
         try:
             db = self._connect()
-        except Exception as error:  # supervision boundary: whatever went wrong must reach the caller of `open`
+        except Exception as error:  # noqa: BLE001 - supervision boundary: whatever went wrong must reach the caller of `open`
             self._post(self._opened, None, error)
             return
         self._post(self._opened, None, None)
@@ -202,7 +202,7 @@ class Store:
                     self._do(db, [call])
                 return
             problem = _problem(error, self.path)
-            log.error("the store failed", path=str(self.path), reason=str(problem))
+            log.error("the store failed", path=str(self.path), reason=str(problem))  # noqa: TRY400 - cause named
             outcomes = [(None, problem)]
         for call, (result, error) in zip(batch, outcomes, strict=True):
             self._post(call.done, result, error)
@@ -251,16 +251,19 @@ class Store:
     def _connect(self) -> sqlite3.Connection:
         self._acquire()
         try:
+            try:
+                return self._prepare()
+            except sqlite3.Error as error:
+                if not _damaged(error):
+                    raise
+                self._move_aside(str(error))
             return self._prepare()
         except sqlite3.Error as error:
-            if not _damaged(error):
-                os.close(self._lock)
-                raise _problem(error, self.path) from error
-            self._move_aside(str(error))
-        except SwiftbotError:
+            os.close(self._lock)
+            raise _problem(error, self.path) from error
+        except BaseException:
             os.close(self._lock)
             raise
-        return self._prepare()
 
     def _acquire(self) -> None:
         try:
@@ -284,15 +287,7 @@ class Store:
             db.execute("PRAGMA journal_mode = WAL")
             self._synchronous = ""
             self._set_synchronous(db, "FULL")
-            found = db.execute("PRAGMA quick_check(1)").fetchone()
-            if found != ("ok",):
-                raise sqlite3.DatabaseError(f"malformed: {found[0] if found else 'no answer'}")
-            version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version > SCHEMA:
-                raise ConfigError(
-                    f"{self.path} was written by a newer version (schema {version}, this one knows {SCHEMA})",
-                    remedy="install that version again, or use another data_dir",
-                )
+            _check(db, self.path)
             db.executescript(_TABLES)
             db.execute(f"PRAGMA user_version = {SCHEMA}")
         except BaseException:
@@ -326,6 +321,18 @@ class Store:
             self._closing = True
             self._some.notify()
         await asyncio.to_thread(self._thread.join)
+
+
+def _check(db: sqlite3.Connection, path: Path) -> None:
+    found = db.execute("PRAGMA quick_check(1)").fetchone()
+    if found != ("ok",):
+        raise sqlite3.DatabaseError(f"malformed: {found[0] if found else 'no answer'}")
+    version = db.execute("PRAGMA user_version").fetchone()[0]
+    if version > SCHEMA:
+        raise ConfigError(
+            f"{path} was written by a newer version (schema {version}, this one knows {SCHEMA})",
+            remedy="install that version again, or use another data_dir",
+        )
 
 
 _COLUMNS = "key, value, version, deleted, write"

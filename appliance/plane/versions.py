@@ -26,7 +26,7 @@ class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     key: str
     value: bytes = b""
-    version: VersionVector = {}  # noqa: RUF012 - msgspec copies an empty default
+    version: VersionVector = {}
     deleted: bool = False
     write: str = ""
     """Id of the last write: a writer that lost the answer and asks again finds its own write done."""

@@ -1,0 +1,131 @@
+"""Opening a Zenoh session as configured, and the forms of its answers and errors: the library's rough edges.
+
+Split from `session` so that what is particular to the library's version stands in one place.
+"""
+# pyright: reportUnknownMemberType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import structlog
+import zenoh
+
+from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError, from_code
+from appliance.model import ErrorReply, encode
+from appliance.plane.settings import PlaneConfig
+
+log = structlog.get_logger(__name__)
+
+_WIRE_HEADROOM = 8
+"""Zenoh itself drops messages of more than so many times the largest payload, before they are whole in memory."""
+
+
+def open_raw(config: PlaneConfig) -> zenoh.Session:
+    """Open a session; blocks. Errors as `Session.open`."""
+    try:
+        return zenoh.open(_zenoh_config(config))
+    except zenoh.ZError as error:
+        raise _open_error(config, str(error)) from error
+
+
+def reply(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None) -> None:
+    """Answer and end a query; the asking side may be gone, which is no concern of ours."""
+    key = str(query.key_expr) if "*" in expr else expr
+    with contextlib.suppress(zenoh.ZError), query:
+        if error is not None or answer is None:
+            error = error or SwiftbotError("no answer")
+            problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
+            body = ErrorReply(code=error.code, message=error.message, remedy=error.remedy, problems=problems)
+            query.reply_err(encode(body), encoding="application/json")
+        else:
+            query.reply(key, answer, encoding="application/json", express=True)
+
+
+def quietly(send: Callable[[], None], key: str) -> None:
+    """Send; a failure (the session is closing, the key is no key) is logged."""
+    try:
+        send()
+    except zenoh.ZError as error:
+        log.warning("not sent", key=key, reason=str(error))
+
+
+def error_of(error: zenoh.ReplyError | None) -> SwiftbotError:
+    """Rebuild the error that the answering side raised."""
+    text = error.payload.to_bytes()[:65_536] if error is not None else b""
+    if text == b"Timeout":  # Zenoh's own way of saying so
+        return DeadlineError("no answer in time")
+    try:
+        body = msgspec.json.decode(text, type=ErrorReply)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return SwiftbotError(f"answered with an error that cannot be read: {text[:200]!r}")
+    rebuilt = from_code(body.code, body.message, body.remedy)
+    if body.problems and hasattr(rebuilt, "problems"):
+        rebuilt.problems = body.problems  # pyright: ignore[reportAttributeAccessIssue]
+    return rebuilt
+
+
+def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
+    """Zenoh's own configuration; design/platform has the measurements behind it."""
+    client = config.mode == "client"
+    settings: dict[str, Any] = {
+        "mode": config.mode,
+        "listen/endpoints": list(config.listen),
+        "listen/exit_on_failure": True,
+        "listen/timeout_ms": 0,
+        "connect/endpoints": list(config.connect),
+        # Peers look for each other for ever in the background, so gateways may start in any order.
+        "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
+        "connect/exit_on_failure": client,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "scouting/delay": 0,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": config.lease_ms,
+        "transport/link/tx/keep_alive": 4,
+        # A peer that takes nothing for a lease is as good as dead: its link is closed and the sender goes on.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": config.lease_ms * 1000,
+        "transport/link/rx/max_message_size": config.max_payload_bytes * _WIRE_HEADROOM,
+        "transport/unicast/open_timeout": 3000,
+        "transport/unicast/accept_timeout": 3000,
+    }
+    made = zenoh.Config()
+    for key, value in settings.items():
+        made.insert_json5(key, msgspec.json.encode(value).decode())
+    return made
+
+
+def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
+    for endpoint in config.listen:
+        if f"bound to {endpoint}" in text or endpoint in text:
+            if "in use" in text:
+                return ConfigError(
+                    f"cannot listen on {endpoint}: the port is in use",
+                    remedy="another gateway may be running; stop it (`swiftbot down`) or change plane.listen",
+                )
+            if "assign requested address" in text:
+                return ConfigError(
+                    f"cannot listen on {endpoint}: this machine has no such address",
+                    remedy="set plane.listen to an address of this machine, or 0.0.0.0",
+                )
+            if "ermission denied" in text:
+                return ConfigError(f"cannot listen on {endpoint}: not permitted", remedy="use a port above 1023")
+            return ConfigError(f"cannot listen on {endpoint}: {_first(text)}", remedy="correct plane.listen")
+    if config.mode == "client":
+        return UnreachableError(
+            f"nothing answers at {', '.join(config.connect)}",
+            remedy="is the fleet up? try `swiftbot up` or `--connect`",
+        )
+    return ConfigError(
+        f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect"
+    )
+
+
+def _first(text: str) -> str:
+    """The message without the library's source locations."""
+    return text.partition(" at /")[0].replace(str(Path.home()), "~")
