@@ -161,8 +161,7 @@ class RobotHub:
         if vehicle.hear(frame, now):
             each.tell = True
         self._session.put(self._session.keys.mavlink(vehicle.name, "rx"), frame.raw, encoding=FRAME_ENCODING)
-        if not vehicle.online and vehicle.heard_at == now and each.queryable is not None:
-            self._online(each)
+        self._see(each, now)
 
     def _welcome(self, index: int, link: MavlinkLink, frame: "Frame", address: Address) -> "_Attached | None":
         """Make a robot of a new system if its frame is an autopilot's heartbeat and it may have a name."""
@@ -208,6 +207,7 @@ class RobotHub:
         async def serve() -> None:
             await ledger.load()
             each.queryable = self._session.serve(self._session.keys.command(name), desk.handle)
+            self._see(each, asyncio.get_running_loop().time())
             log.info("vehicle attached", robot=name, address=address)
 
         task = asyncio.create_task(serve(), name=f"attach {name}")
@@ -224,7 +224,11 @@ class RobotHub:
 
     # --- presence ----------------------------------------------------------------------------------------------
 
-    def _online(self, each: _Attached) -> None:
+    def _see(self, each: _Attached, now: float) -> None:
+        """Bring a vehicle online whose heartbeat is fresh and whose commands can be answered."""
+        fresh = now - each.vehicle.heard_at <= self._config.heartbeat_lost_s
+        if each.vehicle.online or not fresh or each.queryable is None:
+            return
         each.vehicle.online = True
         each.tell = True
         each.token = self._session.declare_alive(self._session.keys.robot_alive(each.vehicle.name))
