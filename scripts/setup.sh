@@ -164,10 +164,10 @@ free_range() {
 }
 
 give_ranges() {
-  local kind start added=
+  local kind start= added=
   for kind in uid gid; do
     if ! grep -qsE "^($RUN_USER|$RUN_UID):" "/etc/sub$kind"; then
-      start=$(free_range)
+      start=${start:-$(free_range)}
       say "id ranges: $RUN_USER gets $start-$((start + RANGE - 1)) in /etc/sub$kind"
       root "id range in /etc/sub$kind" usermod "--add-sub${kind}s" "$start-$((start + RANGE - 1))" "$RUN_USER"
       added=1
@@ -326,13 +326,25 @@ PYTHON
   ) 2>/dev/null
 }
 
+podman_remedy() {
+  if grep -qi 'cannot clone' "$LOG"; then
+    echo "user namespaces are not permitted here: sysctl kernel.unprivileged_userns_clone=1 user.max_user_namespaces=15000; no chroot; in a container, one that may nest containers"
+  elif grep -qi 'uidmap' "$LOG"; then
+    echo "see that $RUN_USER has a range in /etc/subuid and /etc/subgid, and that newuidmap is setuid root (apt-get install --reinstall uidmap)"
+  elif grep -qi cgroup "$LOG"; then
+    echo "the machine must have cgroups mounted: v2, or v1 with a writable hierarchy"
+  else
+    echo "try it by hand: scripts/as_user.sh podman info"
+  fi
+}
+
 start_api() {
   if [ -z "$API_STALE" ] && api_answers; then return; fi
   say "podman: starting the API socket $API_SOCKET"
   local pidfile=$RUNTIME_DIR/swiftbot-podman.pid apilog=$RUNTIME_DIR/swiftbot-podman.log pid tries=0
   : >"$LOG"
   (cd / && as_user podman info) >"$LOG" 2>&1 ||
-    fail "podman does not work for user $RUN_USER" "read the lines above; with 'cgroup' in them, the machine must give this user cgroups (cgroup v2, or v1 mounted); with 'newuidmap', check /etc/subuid and that newuidmap is setuid"
+    fail "podman does not work for user $RUN_USER" "$(podman_remedy)"
   if systemd_runs && [ -S "$RUNTIME_DIR/systemd/private" ]; then
     (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user enable --now podman.socket) || exit 1
     # A socket file that lost its listener is made anew; a service ends by itself and starts with the next request.
