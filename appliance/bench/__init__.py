@@ -1,1 +1,1 @@
-"""Measurements of the product beside its baselines, each in one run on this machine: `swiftbot bench ...`."""
+"""Measurements of what this product promises, each beside its alternative, in one run on one machine."""

@@ -105,7 +105,7 @@ class PooledContainer:
         self.rss_mb = 0.0
         self.first_rss_mb = 0.0
         self.problems: dict[str, str] = {}
-        self._on_death = on_death
+        self._on_death: Callable[[PooledContainer], None] | None = on_death
         self._control: Connection | None = None
         self._spare: Connection | None = None
         self._replies: asyncio.Queue[Frame] = asyncio.Queue(maxsize=16)
@@ -120,6 +120,10 @@ class PooledContainer:
     def become(self, state: ContainerState, *, run: str = "") -> None:
         """Change its state."""
         self.info = msgspec.structs.replace(self.info, state=state, run=run)
+
+    def count_run(self) -> None:
+        """Note that it has had one more run."""
+        self.info = msgspec.structs.replace(self.info, runs=self.info.runs + 1)
 
     async def connect(self, *, timeout_s: float, alive: Callable[[], Any]) -> None:
         """Wait for the runner and open both connections; `alive` is awaited now and then and raises if it ended.
@@ -152,7 +156,8 @@ class PooledContainer:
                     self._replies.put_nowait(frame)
         except PayloadError as error:
             log.warning("runner broke its protocol", container=self.id, reason=error.message)
-        self._on_death(self)
+        if self._on_death is not None:
+            self._on_death(self)
 
     async def _ask(self, frame: Frame, timeout_s: float) -> Frame:
         control = self._control
@@ -211,7 +216,7 @@ class PooledContainer:
 
     def close(self) -> None:
         """Hang up; a run in progress is ended by its runner."""
-        self._on_death = lambda _: None
+        self._on_death = None
         if self._watcher is not None:
             self._watcher.cancel()
         for connection in (self._control, self._spare):

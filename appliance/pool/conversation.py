@@ -198,7 +198,7 @@ class Conversation:
             reply = {"n": call.number, "ok": await self._on_call(call)}
         except SwiftbotError as error:
             reply = self._refusal(call.number, error, retryable=isinstance(error, _TRANSIENT))
-        except Exception as error:  # noqa: BLE001 - supervision boundary: a handler must get an answer, whatever broke
+        except Exception as error:
             log.exception("call broke", run=call.run.run_id, call=call.name)
             reply = self._refusal(call.number, SwiftbotError(f"{type(error).__name__}: {error}"), retryable=True)
         try:

@@ -24,7 +24,7 @@ from typing import Any, Protocol, TypeVar, cast
 import podman
 import requests
 from msgspec import Struct
-from podman.errors import APIError, ImageNotFound, NotFound, PodmanError
+from podman.errors import APIError, ImageNotFound, PodmanError
 
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 

@@ -26,7 +26,7 @@ def _ours(suite: str, release: str) -> bool:
 
 def _trusted(signed_by: str) -> bool:
     """Whether a repository is the distribution's own: signed by its archive key, or by apt's common ring."""
-    name = Path(signed_by.split(",")[0].strip()).name
+    name = Path(signed_by.split(",", maxsplit=1)[0].strip()).name
     return not name or name.startswith(("debian-archive", "ubuntu-archive"))
 
 

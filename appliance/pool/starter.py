@@ -116,16 +116,17 @@ class Starter:
         began = time.monotonic()
         spec = self._spec(container, facts)
         await asyncio.to_thread(container.folder.mkdir, mode=0o700, parents=True)
+
+        async def alive() -> None:
+            found = await engine.containers({**self._labels, LABEL_ID: container.id})
+            if not any(each.running for each in found):
+                raise PoolError(f"container {container.id} of {container.info.image} ended at once")
+
         try:
             for volume in spec.volumes:
                 await engine.ensure_volume(volume, self._labels)
             container.engine_id = await engine.create(spec)
             await engine.start(container.engine_id)
-
-            async def alive() -> None:
-                found = await engine.containers({**self._labels, LABEL_ID: container.id})
-                if not any(each.running for each in found):
-                    raise PoolError(f"container {container.id} of {container.info.image} ended at once")
 
             await container.connect(timeout_s=self._config.start_timeout_s, alive=alive)
         except BaseException as error:

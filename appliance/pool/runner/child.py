@@ -14,12 +14,13 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 from pathlib import Path
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import Any, NoReturn
 
-from .context import Cancelled, Context, Fail, CallError, Frame, Link
+from .context import CallError, Cancelled, Context, Fail, Frame, Link
 from .frames import FrameError, encode
 
 MAX_RESULT = 4 * 2**20
@@ -49,7 +50,7 @@ def load_handler(skill: str, folder: str) -> ModuleType:
     sys.modules[spec.name] = module  # dataclasses and pickle look their module up
     spec.loader.exec_module(module)
     if not callable(getattr(module, "run", None)):
-        raise ImportError(f"{path} has no function run(ctx)")
+        raise ImportError(f"{path} has no function run(ctx)")  # noqa: TRY004 - what cannot be imported as a handler
     return module
 
 
@@ -122,18 +123,22 @@ class _Output:
         self._thread.join(0.2)
 
 
-def _error(code: str, message: str, *, remedy: str = "", retryable: bool = False, trace: list[str] | None = None) -> Frame:
+def _error(
+    code: str, message: str, *, remedy: str = "", retryable: bool = False, trace: list[str] | None = None
+) -> Frame:
     frame: Frame = {"ev": "error", "code": code, "message": message[:4000], "remedy": remedy[:1000]}
     return frame | {"retryable": retryable, "trace": trace or []}
 
 
-def _outcome(order: Frame, link: Link, handler: ModuleType | str, folder: str, scratch: Path, shared: mmap.mmap) -> Frame:
+def _outcome(  # noqa: PLR0911 - one line for each way a handler can end
+    order: Frame, link: Link, handler: ModuleType | str, folder: str, scratch: Path, shared: mmap.mmap
+) -> Frame:
     skill = str(order.get("skill", ""))
     try:
         if isinstance(handler, str):
             handler = load_handler(skill, folder)
         ctx = Context(link, order, scratch)
-        link.send({"ev": "started", "at": _now()})
+        link.send({"ev": "started", "at": time.monotonic_ns()})
         result: Any = handler.run(ctx)
         if result is None:
             result = {}
@@ -160,12 +165,6 @@ def _outcome(order: Frame, link: Link, handler: ModuleType | str, folder: str, s
     return {"ev": "result", "result": result}
 
 
-def _now() -> int:
-    import time  # noqa: PLC0415 - already loaded; kept beside its one use
-
-    return time.monotonic_ns()
-
-
 def _trace(error: BaseException) -> list[str]:
     lines = "".join(traceback.format_exception(error)).rstrip().splitlines()
     return [line[:300] for line in lines[-8:]]
@@ -189,7 +188,12 @@ def main(
 
     os.setsid()
     link = Link(connection, mark)
-    signal.signal(signal.SIGTERM, lambda *_: link.cancel())
+
+    def asked_to_end(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        link.cancel()
+
+    signal.signal(signal.SIGTERM, asked_to_end)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     read_end, write_end = pipe
     null = os.open(os.devnull, os.O_RDONLY)

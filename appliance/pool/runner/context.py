@@ -10,14 +10,14 @@ import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, cast
 
 from .frames import Decoder, FrameError, encode
 
 Frame = dict[str, Any]
 
 
-class Fail(Exception):
+class Fail(Exception):  # noqa: N818 - the word skill writers use: raise ctx.Fail(...)
     """Raised by a handler: it could not do its task, and why.
 
     Args:
@@ -108,7 +108,7 @@ class Link:
                 if reply.get("n") != number:
                     continue  # the answer to a call that a cancel interrupted
                 if "error" in reply:
-                    error = reply["error"] or {}
+                    error = cast("dict[str, Any]", reply["error"] or {})
                     raise CallError(
                         str(error.get("code", "internal")),
                         str(error.get("message", "")),
@@ -151,9 +151,9 @@ class Context:
         scratch: A folder of this run alone, gone afterwards.
     """
 
-    Fail: ClassVar[type[Fail]] = Fail
-    CallError: ClassVar[type[CallError]] = CallError
-    Cancelled: ClassVar[type[Cancelled]] = Cancelled
+    Fail = Fail
+    CallError = CallError
+    Cancelled = Cancelled
 
     def __init__(self, link: Link, order: Frame, scratch: Path) -> None:
         self._link = link
@@ -204,4 +204,4 @@ class Context:
 
     @staticmethod
     def _dict(value: Any) -> dict[str, Any]:
-        return value if isinstance(value, dict) else {}
+        return cast("dict[str, Any]", value) if isinstance(value, dict) else {}

@@ -7,7 +7,7 @@ It exists on its own because the zygote, the child and the tests speak it. Bytes
 import base64
 import binascii
 import json
-from typing import Any
+from typing import Any, cast
 
 MAX_FRAME = 16 * 2**20
 """Longest frame in bytes; a longer one is refused before it is read."""
@@ -21,7 +21,7 @@ class FrameError(Exception):
 
 def _pack(value: Any) -> Any:
     """Turn bytes into their tagged form; `json` calls this for whatever it does not know."""
-    if isinstance(value, (bytes, bytearray, memoryview)):
+    if isinstance(value, (bytes, bytearray)):
         return {BYTES_TAG: base64.b64encode(value).decode("ascii")}
     raise TypeError(f"{type(value).__name__} cannot be sent: use dict, list, str, numbers, bool, None or bytes")
 
@@ -81,4 +81,4 @@ class Decoder:
             raise FrameError(f"not JSON: {error}") from error
         if not isinstance(value, dict):
             raise FrameError(f"not an object but {type(value).__name__}")
-        return value
+        return cast("dict[str, Any]", value)

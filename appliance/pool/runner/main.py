@@ -23,7 +23,7 @@ import time
 import uuid
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any
+from typing import Any, cast
 
 from . import child
 from .context import Frame
@@ -81,7 +81,7 @@ class Zygote:
 
     def __init__(self, path: str, spec: dict[str, Any], *, scratch: Path, processes: int) -> None:
         self._path = path
-        self._folders: dict[str, str] = {str(k): str(v) for k, v in (spec.get("skills") or {}).items()}
+        self._folders = cast("dict[str, str]", spec.get("skills") or {})
         self._modules = [str(each) for each in spec.get("modules") or ()]
         self._scratch = scratch
         self._processes = processes
@@ -115,7 +115,7 @@ class Zygote:
         for end in (wake, waker):
             os.set_blocking(end, False)
         signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.signal(signal.SIGCHLD, _woken)  # a handler of its own, or nothing would be written to `waker`
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._asked_to_stop)
         with contextlib.suppress(FileNotFoundError):
@@ -347,6 +347,11 @@ class Zygote:
                 else:
                     with contextlib.suppress(OSError):
                         entry.unlink()
+
+
+def _woken(number: int, frame: FrameType | None) -> None:
+    """Take a signal that is only to wake the loop."""
+    del number, frame
 
 
 def main() -> None:

@@ -1,0 +1,160 @@
+"""How long a subtask waits for its handler's first line: a new container against a warm one.
+
+Cold is not made worse than it has to be: the same image, runner, mounts and hardening as the warm containers,
+made by the same code through the same API (`mode = "cold"`), one at a time, each removed afterwards. The figure
+in every case is `started.at - entry of Pool.run`, both CLOCK_MONOTONIC of this machine; for a run elsewhere the
+caller gives its own function (`federated`), since only it knows how gateways reach each other.
+"""
+
+import math
+import secrets
+import tempfile
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+from msgspec.structs import replace
+
+from appliance.errors import PoolError, PrerequisiteError
+from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunRequest, Site
+from appliance.pool.pool import Call, Pool
+from appliance.pool.selection import Candidate
+from appliance.pool.settings import PoolConfig
+from appliance.skills.catalogue import load_catalogue
+
+WARM_UP_S = 60.0
+SKILL = "bench_nothing"
+_MANIFEST = """
+id = "bench_nothing"
+domain = "coordination"
+summary = "Do nothing, to measure how long it takes to begin."
+runs = "compute"
+image = "{image}"
+cpu = 0.1
+memory_mb = 64
+"""
+Progress = Callable[[str], None]
+Federated = Callable[[int], Awaitable[Sequence[float]]]
+"""Given a number of runs, the startup of each in milliseconds."""
+
+
+def summary(times_ms: Sequence[float]) -> dict[str, Any]:
+    """Return count, p50, p90, p99 (nearest rank) and max of startups, milliseconds."""
+    ordered = sorted(times_ms)
+
+    def at(part: float) -> float:
+        return round(ordered[max(0, math.ceil(part * len(ordered)) - 1)], 3)
+
+    if not ordered:
+        return {"count": 0}
+    return {"count": len(ordered), "p50": at(0.5), "p90": at(0.9), "p99": at(0.99), "max": round(ordered[-1], 3)}
+
+
+async def run(
+    count: int = 100,
+    cold: int = 5,
+    *,
+    image: str = "base",
+    config: PoolConfig | None = None,
+    federated: Federated | None = None,
+    progress: Progress = lambda _: None,
+) -> dict[str, Any]:
+    """Measure startup, cold and warm, in one run on this machine.
+
+    Args:
+        count: warm runs.
+        cold: cold runs; each makes a container.
+        image: image of the containers.
+        config: pool settings to start from.
+        federated: measures `count` runs in warm containers of another gateway.
+        progress: told what is being measured.
+
+    Returns:
+        For `cold`, `local` and, if measured, `federated`: count, p50, p90, p99, max in milliseconds; and
+        `cold_over_local`, the ratio of the medians.
+
+    Raises:
+        PrerequisiteError: Podman or the image is not there.
+        PoolError: a run did not work.
+    """
+    config = config or PoolConfig()
+    progress(f"cold: {cold} new containers of {image}")
+    async with _pool(replace(config, mode="cold", floor={}), image) as pool:
+        cold_ms = [await _startup(pool, image, number) for number in range(cold)]
+    progress(f"local: {count} runs in warm containers")
+    async with _pool(replace(config, mode="local", floor={image: 2}, capacity=2), image) as pool:
+        await _warm(pool, image, 2)
+        await _startup(pool, image, count)  # the first one pays for lazy imports on this side
+        local_ms = [await _startup(pool, image, number) for number in range(count)]
+    result: dict[str, Any] = {"unit": "ms", "image": image, "cold": summary(cold_ms), "local": summary(local_ms)}
+    if federated is not None:
+        progress(f"federated: {count} runs in warm containers of another gateway")
+        result["federated"] = summary(await federated(count))
+    if cold_ms and local_ms:
+        result["cold_over_local"] = round(result["cold"]["p50"] / result["local"]["p50"], 1)
+    return result
+
+
+@asynccontextmanager
+async def _pool(config: PoolConfig, image: str) -> AsyncIterator[Pool]:
+    """A pool of its own fleet, with a skill that does nothing, gone afterwards."""
+
+    async def nobody(need: Need) -> list[Candidate]:
+        del need
+        return []
+
+    async def nothing(call: Call) -> dict[str, Any]:
+        raise PoolError(f"{call.name} is not served here")
+
+    with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
+        skill = Path(folder) / "skills" / SKILL
+        await anyio.Path(skill).mkdir(parents=True)
+        await anyio.Path(skill / "skill.toml").write_text(_MANIFEST.format(image=image))
+        await anyio.Path(skill / "handler.py").write_text("def run(ctx):\n    return {}\n")
+        pool = Pool(
+            config,
+            gateway="bench",
+            fleet=f"bench-{secrets.token_hex(4)}",
+            run_dir=Path(folder) / "run",
+            catalogue=load_catalogue([skill.parent]),
+            site=Site(),
+            find_remote=nobody,
+            on_call=nothing,
+            on_change=lambda _: None,
+        )
+        await pool.start()
+        try:
+            if pool.problem:
+                raise PrerequisiteError(pool.problem, remedy="swiftbot doctor tells more")
+            yield pool
+        finally:
+            await pool.stop(keep_containers=False)
+
+
+async def _warm(pool: Pool, image: str, count: int) -> None:
+    until = time.monotonic() + WARM_UP_S
+    while sum(each.state is ContainerState.READY and each.image == image for each in pool.containers()) < count:
+        if time.monotonic() > until or pool.problem:
+            raise PrerequisiteError(pool.problem or f"{count} containers of {image} did not start in {WARM_UP_S:g} s")
+        await anyio.sleep(0.02)
+
+
+async def _startup(pool: Pool, image: str, number: int) -> float:
+    """Run the skill that does nothing once; returns its startup in milliseconds."""
+    need = Need(image=image, cpu=0.1, memory_mb=64)
+    request = RunRequest(task="bench", subtask=f"n{number}", attempt=1, skill=SKILL, need=need, deadline_s=10.0)
+    started: list[float] = []
+
+    def note(event: RunEvent) -> None:
+        if event.kind is RunEventKind.STARTED and event.startup_ms is not None:
+            started.append(event.startup_ms)
+
+    decision = await pool.select(need, allow_remote=False)
+    final = await pool.run(request, decision, note)
+    if final.kind is not RunEventKind.SUCCEEDED or not started:
+        reason = final.failure.message if final.failure else "it never started"
+        raise PoolError(f"run {number} did not work: {reason}")
+    return started[0]
