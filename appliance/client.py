@@ -32,11 +32,17 @@ class FleetClient:
         self.endpoint = endpoint
         self._plane: PlaneClient | None = None
 
-    async def __aenter__(self) -> Self:
+    async def open(self) -> Self:
+        """Connect, unless that was done; UnreachableError when nothing answers."""
+        if self._plane is not None:
+            return self
         self._plane = await PlaneClient.open(
             PlaneConfig(mode="client", connect=self.endpoint.connect), fleet=self.endpoint.fleet
         )
         return self
+
+    async def __aenter__(self) -> Self:
+        return await self.open()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

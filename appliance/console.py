@@ -3,6 +3,7 @@
 Rich finds out whether it writes to a terminal: without one there are no colours and no live region.
 """
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -25,8 +26,11 @@ from appliance.pool.images import ImageState
 from appliance.record.facts import LogInfo
 from appliance.tasks.replay import ReplayReport
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+PIPE_WIDTH = 160
+"""Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
+
+out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
 
 _STYLES = {
     SubtaskState.WAITING: "dim",
@@ -121,10 +125,10 @@ def brief(record: SubtaskRecord) -> str:
 
 
 def task_table(record: TaskRecord) -> Group:
-    """A task with its subtasks: where each ran, in which phase, how long, what came of it."""
+    """A task with its subtasks: where each ran, in which phase, how long; below, what came of each. Fits 80 columns."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
-    for name in ("subtask", "skill", "robot", "state", "gateway", "phase", "startup", "took", "tries", "result"):
-        table.add_column(name, overflow="fold", no_wrap=name in ("subtask", "skill", "state", "startup", "took"))
+    for name in ("subtask", "skill", "robot", "state", "gateway", "phase", "startup", "took", "tries"):
+        table.add_column(name, no_wrap=True)
     for each in record.subtasks:
         table.add_row(
             each.subtask.id,
@@ -136,7 +140,6 @@ def task_table(record: TaskRecord) -> Group:
             milliseconds(each.startup_ms),
             milliseconds(each.duration_ms),
             str(each.attempt),
-            brief(each),
         )
     head = Text.assemble(
         ("task ", "bold"),
@@ -145,7 +148,12 @@ def task_table(record: TaskRecord) -> Group:
         (str(record.state), _TASK_STYLES.get(record.state, "yellow")),
         f"  coordinated by {record.coordinator}\n{record.instruction}",
     )
-    parts: list[object] = [head, table]
+    told = [
+        Text(f"  {each.subtask.id}: {text}", style="red" if each.failure and not each.result else "dim")
+        for each in record.subtasks
+        if (text := brief(each))
+    ]
+    parts: list[object] = [head, table, *told]
     if record.failure is not None:
         remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""
         parts.append(Text(f"{record.failure.message}{remedy}", style="red"))

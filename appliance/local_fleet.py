@@ -21,7 +21,7 @@ from msgspec import Struct
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
-from appliance.errors import ConfigError, DeadlineError, NotFoundError, PrerequisiteError, SwiftbotError
+from appliance.errors import ConfigError, DeadlineError, NotFoundError, PrerequisiteError, SwiftbotError, UnreachableError
 from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
@@ -251,13 +251,9 @@ async def _wait_ready(state: FleetState, order: Order, progress: Progress, timeo
     """Wait until every gateway has warm containers, every robot is online and the recorder writes."""
     give_up = time.monotonic() + timeout_s
     told = ""
-    async with FleetClient(state.endpoint) as client:
+    async with await _connect(state, give_up) as client:
         while True:
-            for process in state.processes:
-                if not alive(process):
-                    raise PrerequisiteError(
-                        f"{process.name} ended: {_tail(Path(process.log))}", remedy=f"see {process.log}"
-                    )
+            _check_alive(state)
             missing = _missing(client, state, order)
             if not missing:
                 progress("the fleet is ready")
@@ -271,6 +267,25 @@ async def _wait_ready(state: FleetState, order: Order, progress: Progress, timeo
                 told = missing[0]
                 progress(told)
             await asyncio.sleep(0.1)
+
+
+async def _connect(state: FleetState, give_up: float) -> FleetClient:
+    """Connect as soon as a gateway listens."""
+    while True:
+        _check_alive(state)
+        client = FleetClient(state.endpoint)
+        try:
+            return await client.open()
+        except UnreachableError:
+            if time.monotonic() > give_up:
+                raise
+            await asyncio.sleep(0.1)
+
+
+def _check_alive(state: FleetState) -> None:
+    for process in state.processes:
+        if not alive(process):
+            raise PrerequisiteError(f"{process.name} ended: {_tail(Path(process.log))}", remedy=f"see {process.log}")
 
 
 def _missing(client: FleetClient, state: FleetState, order: Order) -> list[str]:
