@@ -16,6 +16,7 @@ from msgspec import Struct
 from appliance.errors import SwiftbotError, UnreachableError
 from appliance.model import LogLine, Notice, Plan, RunEvent, TaskRecord, TaskRequest
 from appliance.plane.node import PlaneClient
+from appliance.plane.session import Closer
 from appliance.plane.settings import PlaneConfig
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 from appliance.tui.board import Board, Connection, Snapshot
@@ -79,6 +80,7 @@ class FleetView:
         self._client: PlaneClient | None = None
         self._connection = Connection(problem="connecting", remedy="one moment")
         self._keeper: asyncio.Task[None] | None = None
+        self._closers: list[Closer] = []
         self._changes = 0
 
     async def start(self) -> None:
@@ -169,10 +171,12 @@ class FleetView:
 
     def _listen(self, client: PlaneClient) -> None:
         keys, session = client.keys, client.session
-        session.subscribe_typed(keys.task(), TaskRecord, self._on_task)
-        session.subscribe_typed(keys.run(), RunEvent, self._on_run)
-        session.subscribe_typed(keys.notice(), Notice, self._on_notice)
-        session.subscribe_typed(keys.log(), LogLine, self._on_log)
+        self._closers = [  # they end with the session; kept because a token or subscription may end with its handle
+            session.subscribe_typed(keys.task(), TaskRecord, self._on_task),
+            session.subscribe_typed(keys.run(), RunEvent, self._on_run),
+            session.subscribe_typed(keys.notice(), Notice, self._on_notice),
+            session.subscribe_typed(keys.log(), LogLine, self._on_log),
+        ]
         client.registry.on_change.append(self._on_registry)
 
     async def _watch(self, client: PlaneClient) -> None:

@@ -55,7 +55,7 @@ class Gateway:
         self._rpc.register("submit", TaskRequest, self._submit)
         self._rpc.register("tasks", TasksAsk, self._tasks)
         self._rpc.register("cancel", TaskAsk, self._cancel)
-        session.declare_alive(self.keys.alive("gw-a"))
+        self._token = session.declare_alive(self.keys.alive("gw-a"))
         self._beat = asyncio.create_task(self._run())
 
     async def _plan(self, ask: PlanAsk) -> PlanAnswer:
@@ -118,12 +118,13 @@ def _seen(app: SwiftbotApp) -> str:
 
 
 async def _see(app: SwiftbotApp, pilot: Pilot[None], *wanted: str | Callable[[str], bool]) -> str:
-    """Wait until the screen shows all that is wanted; the test's own timeout bounds it."""
-    while True:
+    """Wait until the screen shows all that is wanted; after half a minute, fail with what it shows."""
+    for _ in range(600):
         text = _seen(app)
         if all(part in text if isinstance(part, str) else part(text) for part in wanted):
             return text
         await pilot.pause(0.05)
+    pytest.fail(f"the screen does not show {wanted}:\n{_seen(app)}")
 
 
 async def test_fleet_and_pool_are_live(gateway: Gateway, app: SwiftbotApp) -> None:
