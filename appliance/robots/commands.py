@@ -133,7 +133,9 @@ class CommandDesk:
         verb = self.verbs.get(command.verb)
         if kind is None or (verb is None and command.verb != "stop"):
             known = ", ".join(sorted({*self.verbs, "stop"}))
-            raise RobotFailure("refused", f"{self.robot} does not know {command.verb[:40]!r}", remedy=f"it can: {known}")
+            raise RobotFailure(
+                "refused", f"{self.robot} does not know {command.verb[:40]!r}", remedy=f"it can: {known}"
+            )
         verdict, stored = self._ledger.decide(command)
         if verdict is Verdict.STALE:
             raise RobotFailure(
@@ -224,8 +226,8 @@ class CommandDesk:
     async def _write(self, command: RobotCommand, reply: RobotReply) -> None:
         try:
             await self._ledger.finish(command, reply)
-        except SwiftbotError as error:
-            log.error("outcome not written to the ledger", robot=self.robot, id=command.id, error=str(error))
+        except SwiftbotError:
+            log.exception("outcome not written to the ledger", robot=self.robot, id=command.id)
 
     async def _join(self, running: _Running) -> RobotReply:
         try:
@@ -292,39 +294,43 @@ async def send_command(session: Session, robot: str, command: RobotCommand, *, t
         RobotError: the answer is no RobotReply.
         SwiftbotError: what else the answering side refused, such as PayloadError.
     """
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + timeout_s
-    heard = loop.time()
-    key, payload = session.keys.command(robot), encode(command)
     try:
-        while True:
-            remaining = deadline - loop.time()
-            if remaining <= 0:
-                raise DeadlineError(
-                    f"{robot} did not end {command.verb} within {timeout_s:g} s", remedy="allow more time"
-                )
-            try:
-                answer = await session.query(key, payload, timeout_s=min(remaining, LONG_POLL_S + GRACE_S))
-            except DeadlineError:
-                heard = loop.time()
-                continue
-            except UnreachableError as error:
-                if loop.time() - heard >= min(UNREACHABLE_S, timeout_s):
-                    raise UnreachableError(
-                        f"no answer from robot {robot}: {error.message}",
-                        remedy="`swiftbot robots` shows who is online; is its gateway up?",
-                    ) from error
-                await asyncio.sleep(min(_ASK_AGAIN_S, max(deadline - loop.time(), 0.0)))
-                continue
-            try:
-                return msgspec.json.decode(answer, type=RobotReply)
-            except msgspec.DecodeError as error:
-                raise RobotError(f"{robot} answered {command.verb} with something else: {error}") from error
+        return await _ask_until(session, robot, command, timeout_s)
     except (asyncio.CancelledError, DeadlineError):
         task = asyncio.get_running_loop().create_task(_send_stop(session, robot, command))
         _stopping.add(task)
         task.add_done_callback(_stopping.discard)
         raise
+
+
+async def _ask_until(session: Session, robot: str, command: RobotCommand, timeout_s: float) -> RobotReply:
+    loop = asyncio.get_running_loop()
+    heard = loop.time()
+    deadline = heard + timeout_s
+    key, payload = session.keys.command(robot), encode(command)
+    silent: UnreachableError | None = None
+    while (remaining := deadline - loop.time()) > 0:
+        try:
+            answer = await session.query(key, payload, timeout_s=min(remaining, LONG_POLL_S + GRACE_S))
+        except DeadlineError:
+            heard, silent = loop.time(), None
+            continue
+        except UnreachableError as error:
+            silent = error
+            if loop.time() - heard >= UNREACHABLE_S:
+                break
+            await asyncio.sleep(min(_ASK_AGAIN_S, max(deadline - loop.time(), 0.0)))
+            continue
+        try:
+            return msgspec.json.decode(answer, type=RobotReply)
+        except msgspec.DecodeError as error:
+            raise RobotError(f"{robot} answered {command.verb} with something else: {error}") from error
+    if silent is not None:
+        raise UnreachableError(
+            f"no answer from robot {robot}: {silent.message}",
+            remedy="`swiftbot robots` shows who is online; is its gateway up?",
+        ) from silent
+    raise DeadlineError(f"{robot} did not end {command.verb} within {timeout_s:g} s", remedy="allow more time")
 
 
 async def _send_stop(session: Session, robot: str, command: RobotCommand) -> None:

@@ -1,68 +1,30 @@
-"""A gateway's MAVLink vehicles on the plane: roster entries, commands, raw frames; and tasks that robots ask for.
+"""Robots as one gateway has them: its MAVLink vehicles, and the tasks that robots of the fleet ask for.
 
-A vehicle becomes a robot of the fleet by its autopilot's heartbeat, under the name its link gives it. From then
-on the hub speaks for it: it puts RobotInfo, holds its liveliness token while heartbeats come, answers commands,
-and puts every frame of it on the plane for the recorder. Zenoh robots speak for themselves; the hub only sees to
-it that no vehicle takes a name that is theirs.
+Zenoh robots speak for themselves and need nothing of a gateway; MAVLink vehicles are spoken for by the station.
 """
 
-import asyncio
-import contextlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import structlog
-
-from appliance.errors import SwiftbotError
-from appliance.model import Failure, Site, TaskRequest, encode
-from appliance.plane.session import Closer, Session
-from appliance.plane.store import Store
-from appliance.robots.commands import CommandDesk
+from appliance.model import Site, TaskRequest
+from appliance.plane.session import Session
 from appliance.robots.intake import TaskIntake
-from appliance.robots.ledger import Ledger
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.ledger import KeyValues
+from appliance.robots.settings import RobotsConfig
 
 if TYPE_CHECKING:
-    from appliance.robots.mavlink.copter import Copter
-    from appliance.robots.mavlink.dialect import Frame, Message
-    from appliance.robots.mavlink.endpoint import Endpoint
-    from appliance.robots.mavlink.vehicle import Vehicle
-
-log = structlog.get_logger(__name__)
-
-FRAME_ENCODING = "application/mavlink"
-_TICK_S = 0.05
-_OFFLINE_INFO_S = 5.0
-"""How often the roster is reminded of a vehicle that is offline."""
-_STREAMS_HZ = {"GLOBAL_POSITION_INT": 5.0, "SYS_STATUS": 1.0, "MISSION_CURRENT": 2.0, "HOME_POSITION": 0.2}
-"""What is asked of a vehicle that has come online; ArduPilot sends little of it by itself."""
-
-Address = tuple[str, int]
-
-
-class _Attached:
-    """A vehicle and all that serves it."""
-
-    def __init__(self, vehicle: "Vehicle", copter: "Copter", desk: CommandDesk, address: Address) -> None:
-        self.vehicle = vehicle
-        self.copter = copter
-        self.desk = desk
-        self.address = address
-        self.told_at = 0.0
-        self.tell = True
-        self.token: Closer | None = None
-        self.queryable: Closer | None = None
+    from appliance.robots.mavlink.station import Station
 
 
 class RobotHub:
-    """One per gateway. `refused` counts bad input by kind; `attached` names the vehicles heard so far."""
+    """One per gateway. `refused` counts bad input by kind."""
 
     def __init__(
         self,
         config: RobotsConfig,
         *,
         session: Session,
-        store: Store,
+        store: KeyValues,
         gateway: str,
         site: Site,
         on_task: Callable[[str, TaskRequest], None] | None = None,
@@ -74,256 +36,37 @@ class RobotHub:
         self._site = site
         self.refused: dict[str, int] = {}
         self._intake = None if on_task is None else TaskIntake(session, on_task, self.refused)
-        self._endpoints: list[Endpoint] = []
-        self._vehicles: dict[str, _Attached] = {}
-        self._by_source: dict[tuple[int, int], _Attached] = {}
-        self._others: set[str] = set()
-        self._watch: Closer | None = None
-        self._ticking: asyncio.Task[None] | None = None
-        self._attaching: set[asyncio.Task[None]] = set()
+        self._station: Station | None = None
 
     @property
     def attached(self) -> tuple[str, ...]:
         """Names of the MAVLink vehicles heard since start, online or not."""
-        return tuple(sorted(self._vehicles))
+        return () if self._station is None else self._station.attached
 
     async def start(self) -> None:
-        """Bind the ports and begin; ConfigError with the remedy when a port is taken."""
+        """Bind the ports and begin; ConfigError with the remedy when a setting is wrong or a port taken."""
         self._config.check()
+        if self._config.mavlink:
+            # pymavlink's dialect costs 15 MB and 30 ms: only gateways with vehicles pay for it.
+            from appliance.robots.mavlink.station import Station  # noqa: PLC0415
+
+            station = Station(
+                self._config,
+                session=self._session,
+                store=self._store,
+                gateway=self._gateway,
+                site=self._site,
+                refused=self.refused,
+            )
+            await station.start()
+            self._station = station
         if self._intake is not None:
             self._intake.start()
-        if not self._config.mavlink:
-            return
-        # pymavlink's dialect costs 15 MB and 30 ms: only gateways with vehicles pay for it.
-        from appliance.robots.mavlink.dialect import Codec
-        from appliance.robots.mavlink.endpoint import Endpoint
-
-        try:
-            for index, link in enumerate(self._config.mavlink):
-                codec = Codec(self._config.system_id, self._config.component_id)
-                endpoint = await Endpoint.open(link.address(), codec, self._receiver(index, link), self.refused)
-                self._endpoints.append(endpoint)
-                log.info("MAVLink port open", listen=link.listen)
-        except SwiftbotError:
-            await self.stop()
-            raise
-        self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
-        self._ticking = asyncio.create_task(self._tick(), name="robot hub")
 
     async def stop(self) -> None:
-        """End commands (they are resumed by the next process), take back what was declared, close the ports."""
-        for task in (self._ticking, *self._attaching):
-            if task is not None:
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
-        self._ticking = None
-        for each in self._vehicles.values():
-            await each.desk.close()
-            for closer in (each.queryable, each.token):
-                if closer is not None:
-                    closer.close()
-            if each.vehicle.online:
-                each.vehicle.online = False
-                self._tell(each, "its gateway is stopping")
-        self._vehicles.clear()
-        self._by_source.clear()
-        for endpoint in self._endpoints:
-            endpoint.close()
-        self._endpoints.clear()
-        if self._watch is not None:
-            self._watch.close()
-            self._watch = None
+        """End commands (the next process resumes them), take back what was declared, close the ports."""
         if self._intake is not None:
             self._intake.stop()
-
-    # --- frames ------------------------------------------------------------------------------------------------
-
-    def _receiver(self, index: int, link: MavlinkLink) -> "Callable[[Frame, Address], None]":
-        def receive(frame: "Frame", address: Address) -> None:
-            self._receive(index, link, frame, address)
-
-        return receive
-
-    def _receive(self, index: int, link: MavlinkLink, frame: "Frame", address: Address) -> None:
-        each = self._by_source.get((index, frame.system))
-        if each is None:
-            each = self._welcome(index, link, frame, address)
-            if each is None:
-                return
-        if address != each.address:
-            if each.vehicle.online:
-                self._count("address_conflict")
-                return
-            each.address = address  # restarted, or back over another way
-        vehicle = each.vehicle
-        now = asyncio.get_running_loop().time()
-        if vehicle.hear(frame, now):
-            each.tell = True
-        self._session.put(self._session.keys.mavlink(vehicle.name, "rx"), frame.raw, encoding=FRAME_ENCODING)
-        self._see(each, now)
-
-    def _welcome(self, index: int, link: MavlinkLink, frame: "Frame", address: Address) -> "_Attached | None":
-        """Make a robot of a new system if its frame is an autopilot's heartbeat and it may have a name."""
-        from appliance.robots.mavlink import dialect
-
-        name = link.name_of(frame.system)
-        known = sum(source == index for source, _ in self._by_source)
-        if frame.system == self._config.system_id or name is None or known >= self._config.max_vehicles:
-            self._count("unknown_system")
-            return None
-        if frame.name != "HEARTBEAT" or (
-            frame.message.autopilot == dialect.AUTOPILOT_NONE or frame.message.type == dialect.TYPE_GROUND_STATION
-        ):
-            self._count("unknown_system")
-            return None
-        if name in self._vehicles or name in self._others:
-            self._count("name_conflict")
-            log.warning("vehicle refused: its name is taken", robot=name, system=frame.system)
-            return None
-        each = self._attach(index, name, address)
-        self._by_source[index, frame.system] = each
-        return each
-
-    def _attach(self, index: int, name: str, address: Address) -> _Attached:
-        from appliance.robots.mavlink.copter import Copter
-        from appliance.robots.mavlink.vehicle import Vehicle
-
-        vehicle = Vehicle(name, site=self._site, send=lambda message: self._send(index, name, message))
-        copter = Copter(vehicle, site=self._site, config=self._config)
-        ledger = Ledger(name, self._store, limit=self._config.ledger)
-        desk = CommandDesk(
-            name,
-            session=self._session,
-            ledger=ledger,
-            verbs=copter.verbs(),
-            ready=copter.ready,
-            halt=copter.halt,
-            refused=self.refused,
-        )
-        each = _Attached(vehicle, copter, desk, address)
-        self._vehicles[name] = each
-
-        async def serve() -> None:
-            await ledger.load()
-            each.queryable = self._session.serve(self._session.keys.command(name), desk.handle)
-            self._see(each, asyncio.get_running_loop().time())
-            log.info("vehicle attached", robot=name, address=address)
-
-        task = asyncio.create_task(serve(), name=f"attach {name}")
-        self._attaching.add(task)
-        task.add_done_callback(self._attaching.discard)
-        return each
-
-    def _send(self, index: int, name: str, message: "Message") -> None:
-        each = self._vehicles.get(name)
-        if each is None or index >= len(self._endpoints):
-            return
-        raw = self._endpoints[index].send(message, each.address)
-        self._session.put(self._session.keys.mavlink(name, "tx"), raw, encoding=FRAME_ENCODING)
-
-    # --- presence ----------------------------------------------------------------------------------------------
-
-    def _see(self, each: _Attached, now: float) -> None:
-        """Bring a vehicle online whose heartbeat is fresh and whose commands can be answered."""
-        fresh = now - each.vehicle.heard_at <= self._config.heartbeat_lost_s
-        if each.vehicle.online or not fresh or each.queryable is None:
-            return
-        each.vehicle.online = True
-        each.tell = True
-        each.token = self._session.declare_alive(self._session.keys.robot_alive(each.vehicle.name))
-        self._ask_streams(each)
-        log.info("vehicle online", robot=each.vehicle.name)
-
-    def _ask_streams(self, each: _Attached) -> None:
-        from appliance.robots.mavlink import dialect
-
-        for stream, hz in _STREAMS_HZ.items():
-            fields = {f"param{number}": 0.0 for number in range(3, 8)}
-            each.vehicle.send(
-                dialect.make(
-                    "COMMAND_LONG",
-                    target_system=each.vehicle.system,
-                    target_component=each.vehicle.component,
-                    command=dialect.SET_INTERVAL,
-                    confirmation=0,
-                    param1=float(dialect.constant(f"MAVLINK_MSG_ID_{stream}")),
-                    param2=1e6 / hz,
-                    **fields,
-                )
-            )
-
-    async def _lost(self, each: _Attached) -> None:
-        each.vehicle.online = False
-        each.tell = True
-        if each.token is not None:
-            each.token.close()
-            each.token = None
-        log.warning("vehicle offline", robot=each.vehicle.name)
-        self._tell(each, "no heartbeat")
-        await each.desk.fail_all(
-            Failure(
-                code="robot",
-                message=f"{each.vehicle.name} went offline: no heartbeat for {self._config.heartbeat_lost_s:g} s",
-                remedy="check its power and its link",
-                retryable=True,
-            )
-        )
-
-    def _robot_seen(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the shape of watch_alive's callback
-        name = key.split("/")[-2]
-        if not alive:
-            self._others.discard(name)
-        elif name not in self._vehicles:
-            self._others.add(name)
-
-    async def _tick(self) -> None:
-        """Send heartbeats, notice lost ones, tell the roster."""
-        loop = asyncio.get_running_loop()
-        beat_at = 0.0
-        while True:
-            now = loop.time()
-            if now >= beat_at:
-                beat_at = now + self._config.heartbeat_s
-                self._beat()
-            for each in list(self._vehicles.values()):
-                if each.vehicle.online and now - each.vehicle.heard_at > self._config.heartbeat_lost_s:
-                    await self._lost(each)
-                interval = 1.0 / self._config.state_hz if each.vehicle.online else _OFFLINE_INFO_S
-                if each.queryable is not None and (each.tell or now - each.told_at >= interval):
-                    self._tell(each)
-            await asyncio.sleep(_TICK_S)
-
-    def _beat(self) -> None:
-        from appliance.robots.mavlink import dialect
-
-        for each in self._vehicles.values():
-            each.vehicle.send(
-                dialect.make(
-                    "HEARTBEAT",
-                    type=dialect.TYPE_ONBOARD,
-                    autopilot=dialect.AUTOPILOT_NONE,
-                    base_mode=0,
-                    custom_mode=0,
-                    system_status=dialect.STATE_ACTIVE,
-                    mavlink_version=3,
-                )
-            )
-
-    def _tell(self, each: _Attached, note: str = "") -> None:
-        """Put the roster entry; the verbs follow from what the last heartbeat said it is."""
-        each.tell = False
-        each.told_at = asyncio.get_running_loop().time()
-        each.desk.verbs = each.copter.verbs()
-        if not note and not each.vehicle.online:
-            note = "no heartbeat"
-        elif not note and not each.vehicle.commandable:
-            note = "watched, not commanded: only ArduPilot multirotors are so far"
-        elif not note:
-            note = ", ".join(each.desk.busy)
-        verbs = (*each.desk.verbs, "stop") if each.vehicle.commandable else tuple(each.desk.verbs)
-        info = each.vehicle.info(self._gateway, verbs, note)
-        self._session.put(self._session.keys.robot(each.vehicle.name), encode(info))
-
-    def _count(self, what: str) -> None:
-        self.refused[what] = self.refused.get(what, 0) + 1
+        if self._station is not None:
+            await self._station.stop()
+            self._station = None

@@ -10,6 +10,7 @@ want to hear "not airborne". It lands only when told to.
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
+from itertools import pairwise
 
 import msgspec
 import structlog
@@ -239,9 +240,7 @@ class Copter:
     async def _mode(self, name: str) -> None:
         wanted = dialect.COPTER_MODES[name]
         for _ in range(_ROUNDS):
-            await command(
-                self._vehicle, dialect.SET_MODE, dialect.CUSTOM_MODE_FLAG, wanted, patience=self._patience
-            )
+            await command(self._vehicle, dialect.SET_MODE, dialect.CUSTOM_MODE_FLAG, wanted, patience=self._patience)
             if await self._confirm(lambda: self._vehicle.custom_mode == wanted):
                 return
         raise RobotFailure(
@@ -338,7 +337,7 @@ class Copter:
         """Metres left to fly: to the next waypoint by the mission's own count (item `last`), and along the rest."""
         behind = max(0, min(len(way) - 1, last - self._vehicle.mission_at))
         rest = way[len(way) - 1 - behind :]
-        return self._distance(*rest[0]) + sum(math.dist(one, other) for one, other in zip(rest, rest[1:], strict=False))
+        return self._distance(*rest[0]) + sum(math.dist(one, other) for one, other in pairwise(rest))
 
     def _where(self) -> dict[str, object]:
         pose = self._vehicle.pose

@@ -129,7 +129,8 @@ def constant(name: str) -> int:
 
 def label(enum: str, value: int) -> str:
     """Return the name of an enum's value, its number when it has none."""
-    entry: Any = _dialect.enums.get(enum, {}).get(value)
+    enums: Any = _dialect.enums
+    entry: Any = enums.get(enum, {}).get(value)
     return str(value) if entry is None else str(entry.name)
 
 

@@ -144,9 +144,10 @@ async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience)
                 sent.clear()
                 _send_count(vehicle, items)
                 continue
+            reason = f"{label('MAV_MISSION_RESULT', answer.type)} {vehicle.text}".strip()
             raise RobotFailure(
                 "robot",
-                f"{vehicle.name} refuses the mission: {label('MAV_MISSION_RESULT', answer.type)} {vehicle.text}".strip(),
+                f"{vehicle.name} refuses the mission: {reason}",
                 remedy="look at the waypoints and the vehicle's fence",
             )
     raise RobotFailure(

@@ -6,7 +6,7 @@ State is only ever what the vehicle has said of itself; nothing is assumed from 
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 
 from appliance.model import Pose, RobotInfo, Site
@@ -139,7 +139,7 @@ class Vehicle:
         return changed
 
     @asynccontextmanager
-    async def listening(self, *names: str) -> AsyncIterator[asyncio.Queue[Message]]:
+    async def listening(self, *names: str) -> AsyncGenerator[asyncio.Queue[Message]]:
         """Collect messages of those names while the block runs; begin before sending what they answer."""
         queue: asyncio.Queue[Message] = asyncio.Queue(MAX_WAITING)
         entry = (frozenset(names), queue)

@@ -66,9 +66,7 @@ def colour_of(name: str) -> tuple[int, int, int]:
         return PALETTE["grey"]
 
 
-def render(
-    world: World, pose: Pose, view: Aim, *, robot: str, width: int = WIDTH, height: int = HEIGHT
-) -> Image.Image:
+def render(world: World, pose: Pose, view: Aim, *, robot: str, width: int = WIDTH, height: int = HEIGHT) -> Image.Image:
     """Return what the robot's camera sees from `pose` along `view`."""
     eye = np.array([pose.x, pose.y, EYE_M], dtype=np.float32)
     rays = _rays(view, width, height)
@@ -124,8 +122,7 @@ def _ground(world: World, eye: Floats, rays: Floats) -> Pixels:
 
 def _solids(world: World, pose: Pose, robot: str) -> list[_Solid]:
     solids = [
-        _Solid((box.x[0], box.y[0], 0.0), (box.x[1], box.y[1], _OBSTACLE_M), _OBSTACLE)
-        for box in world.site.obstacles
+        _Solid((box.x[0], box.y[0], 0.0), (box.x[1], box.y[1], _OBSTACLE_M), _OBSTACLE) for box in world.site.obstacles
     ]
     heading = math.radians(pose.heading_deg)
     for thing in world.things:
@@ -135,9 +132,7 @@ def _solids(world: World, pose: Pose, robot: str) -> list[_Solid]:
         if thing.holder == robot:
             x, y = pose.x + _HELD_AHEAD_M * math.sin(heading), pose.y + _HELD_AHEAD_M * math.cos(heading)
             low, half = _HELD_UP_M, min(half, 0.2)
-        solids.append(
-            _Solid((x - half, y - half, low), (x + half, y + half, low + 2 * half), colour_of(thing.colour))
-        )
+        solids.append(_Solid((x - half, y - half, low), (x + half, y + half, low + 2 * half), colour_of(thing.colour)))
     return solids
 
 

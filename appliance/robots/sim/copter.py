@@ -67,7 +67,7 @@ class SimCopter:
 
     # --- messages in -------------------------------------------------------------------------------------------
 
-    def handle(self, frame: Frame, now: float) -> list[Message]:
+    def handle(self, frame: Frame, now: float) -> list[Message]:  # noqa: PLR0911 - one case a message
         """Take in a message that may be for this vehicle; return the answers."""
         message = frame.message
         if getattr(message, "target_system", self.system) not in (0, self.system):
@@ -107,9 +107,7 @@ class SimCopter:
                 return []
 
     def _command(self, message: Message, sender: tuple[int, int]) -> list[Message]:
-        values = tuple(
-            float(getattr(message, f"param{number}", 0.0)) for number in range(1, 5)
-        )
+        values = tuple(float(getattr(message, f"param{number}", 0.0)) for number in range(1, 5))
         height = float(message.z if hasattr(message, "z") else message.param7)
         result = self._do(int(message.command), values, height)
         ack = make(

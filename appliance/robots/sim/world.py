@@ -76,9 +76,7 @@ class World:
         exact = self._things.get(wanted)
         if exact is not None:
             return exact
-        fitting = [
-            thing for key, thing in self._things.items() if wanted and set(wanted.split()) <= set(key.split())
-        ]
+        fitting = [thing for key, thing in self._things.items() if wanted and set(wanted.split()) <= set(key.split())]
         return min(fitting, key=lambda thing: math.hypot(thing.x - x, thing.y - y), default=None)
 
     def obstacle(self, name: str) -> Box | None:

@@ -326,7 +326,9 @@ class Rover:
             frames[f"frame-{number:03d}.jpg"] = data
             # A picture that took longer than its turn is not waited for on top.
             await asyncio.sleep(max(0.0, 1.0 / fps / self._rate - (time.monotonic() - began)))
-        return Done({"target": args.target, "frames": count, "duration_s": duration, "fps": fps} | self._where(), frames)
+        return Done(
+            {"target": args.target, "frames": count, "duration_s": duration, "fps": fps} | self._where(), frames
+        )
 
     def _aim(self, target: str) -> tuple[Pose, Aim]:
         pose = self.driving.pose
