@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import sdnotify
 import uvloop
 from cyclopts import App, CycloptsError, Group, Parameter
 
@@ -226,7 +227,11 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
 
     async def go() -> None:
         # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
-        await run_recorder(settings, PlaneConfig(mode="peer", connect=connect), fleet, _until_signalled())
+        plane = PlaneConfig(mode="peer", connect=connect)
+        notifier = sdnotify.SystemdNotifier()
+        await run_recorder(
+            settings, plane, fleet, _until_signalled(), alive=lambda _: notifier.notify("READY=1\nWATCHDOG=1")
+        )
 
     uvloop.run(go())
     return 0
