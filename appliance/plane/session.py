@@ -19,7 +19,6 @@ import msgspec
 import structlog
 import zenoh
 from msgspec import Struct
-from zenoh.handlers import Callback
 
 from appliance.errors import DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.plane import link
@@ -150,7 +149,7 @@ class Session:
             if not closer.closed:
                 callback(message)
 
-        subscriber = self._raw.declare_subscriber(expr, Callback(take, indirect=False))
+        subscriber = self._raw.declare_subscriber(expr, zenoh.handlers.Callback(take, indirect=False))
         closer = Closer(subscriber.undeclare)
         return closer
 
@@ -204,7 +203,7 @@ class Session:
                 group.add(task)
                 task.add_done_callback(group.discard)
 
-        queryable = self._raw.declare_queryable(expr, Callback(take, indirect=False), complete=True)
+        queryable = self._raw.declare_queryable(expr, zenoh.handlers.Callback(take, indirect=False), complete=True)
         return Closer(queryable.undeclare)
 
     async def _answer(
@@ -321,7 +320,7 @@ class Session:
         send = partial(
             self._raw.get,
             expr,
-            Callback(take, drop=partial(self._inbox.post, on_end, must=True), indirect=False),
+            zenoh.handlers.Callback(take, drop=partial(self._inbox.post, on_end, must=True), indirect=False),
             target=target,
             consolidation=zenoh.ConsolidationMode.NONE,
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
@@ -351,7 +350,7 @@ class Session:
         ask = partial(
             self._raw.liveliness().get,
             expr,
-            Callback(take, drop=partial(self._inbox.post, ended.set, must=True), indirect=False),
+            zenoh.handlers.Callback(take, drop=partial(self._inbox.post, ended.set, must=True), indirect=False),
             timeout=timeout_s,
         )
         self._send(expr, cast("Callable[[], None]", ask), 0)
@@ -372,7 +371,7 @@ class Session:
                 callback(key, alive)
 
         # What comes before `closer` is bound waits in the inbox: it is delivered by a later turn of the loop.
-        subscriber = self._raw.liveliness().declare_subscriber(expr, Callback(take, indirect=False), history=True)
+        subscriber = self._raw.liveliness().declare_subscriber(expr, zenoh.handlers.Callback(take, indirect=False), history=True)
         closer = Closer(subscriber.undeclare)
         return closer
 

@@ -1,0 +1,31 @@
+"""The plane's configuration."""
+
+import pytest
+
+from appliance.errors import ConfigError
+from appliance.plane.settings import PlaneConfig
+
+
+def test_the_defaults_are_valid() -> None:
+    """An empty configuration works."""
+    PlaneConfig().check()
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (PlaneConfig(listen=("127.0.0.1:7447",)), "plane.listen"),
+        (PlaneConfig(listen=("tcp/127.0.0.1",)), "no valid port"),
+        (PlaneConfig(connect=("tcp/host:99999",)), "no valid port"),
+        (PlaneConfig(connect=("http/host:80",)), "plane.connect"),
+        (PlaneConfig(mode="client"), "plane.connect is empty"),
+        (PlaneConfig(replicas=0), "plane.replicas"),
+        (PlaneConfig(lease_ms=1), "plane.lease_ms"),
+        (PlaneConfig(max_record_bytes=8 * 2**20), "max_record_bytes"),
+    ],
+)
+def test_what_cannot_work_is_named(config: PlaneConfig, says: str) -> None:
+    """A setting that cannot work is an error that names it, with a remedy."""
+    with pytest.raises(ConfigError, match=says) as caught:
+        config.check()
+    assert caught.value.remedy
