@@ -4,6 +4,7 @@ Textual's part of it, nothing else: it works at 80 columns by 24 lines over SSH,
 only what changed, and never stops because the network does.
 """
 
+import contextlib
 import re
 import uuid
 from collections.abc import Iterable
@@ -14,6 +15,7 @@ import structlog
 from rich.text import Text
 from textual import on
 from textual.app import App, ComposeResult, SystemCommand
+from textual.css.query import NoMatches
 from textual.screen import Screen
 from textual.widgets import ContentSwitcher, Footer, Input, Static
 
@@ -75,6 +77,8 @@ class SwiftbotApp(App[None]):
         self._config = config or TuiConfig()
         self._config.check()
         self._drawn_revision: object = None
+        self.pane_name = "fleet"
+        """Which pane is shown: fleet, tasks, pool or log."""
 
     def compose(self) -> ComposeResult:
         """Make the screen."""
@@ -92,7 +96,7 @@ class SwiftbotApp(App[None]):
         """Begin to listen and to draw."""
         self.sub_title = self._view.fleet
         await self._view.start()
-        self.set_interval(1 / self._config.refresh_hz, self.draw)
+        self.set_interval(1 / self._config.refresh_hz, self._redraw)
         self.action_show("fleet")
 
     async def on_unmount(self) -> None:
@@ -104,18 +108,15 @@ class SwiftbotApp(App[None]):
     @property
     def pane(self) -> Pane:
         """The pane that is shown."""
-        switcher = self.query_one(ContentSwitcher)
-        return switcher.query_one(f"#{switcher.current}", Pane)
+        return self.query_one(f"#pane-{self.pane_name}", Pane)
 
-    @property
-    def pane_name(self) -> str:
-        """Its name: fleet, tasks, pool or log."""
-        return str(self.query_one(ContentSwitcher).current).removeprefix("pane-")
+    def _redraw(self) -> None:
+        # While the app ends, the timer may still fire when parts of the screen are gone.
+        with contextlib.suppress(NoMatches):
+            self.draw()
 
     def draw(self, *, force: bool = False) -> None:
         """Draw what is new; nothing when nothing is."""
-        if len(self.screen_stack) == 0 or not self.screen_stack[0].is_mounted:
-            return
         revision = (self._view.revision, self.pane_name, self.pane.shown_filter)
         if revision == self._drawn_revision and not force:
             return
@@ -144,11 +145,12 @@ class SwiftbotApp(App[None]):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Cancel is offered where a task is selected."""
         if action == "cancel_task":
-            return self.is_mounted and self.pane_name == "tasks"
+            return self.pane_name == "tasks"
         return super().check_action(action, parameters)
 
     def action_show(self, name: str) -> None:
         """Show a pane."""
+        self.pane_name = name
         self.query_one(ContentSwitcher).current = f"pane-{name}"
         self.query_one(_FOCUS[name]).focus()
         field = self.query_one("#filter", Input)

@@ -7,7 +7,7 @@ drawn when nothing has changed.
 from collections import deque
 from collections.abc import Iterable
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from appliance.model import (
     ContainerInfo,
@@ -19,6 +19,7 @@ from appliance.model import (
     RunEventKind,
     TaskRecord,
 )
+from appliance.record.facts import RecorderStatus
 
 
 class Connection(Struct, frozen=True, kw_only=True):
@@ -51,11 +52,19 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     robots: tuple[RobotInfo, ...] = ()
     tasks: tuple[TaskRecord, ...] = ()
     entries: tuple[Entry, ...] = ()
+    recorders: tuple[RecorderStatus, ...] = ()
+    """Recorders by name; one not heard for a while has the state `silent`."""
 
     def task(self, task_id: str) -> TaskRecord | None:
         """Return a task's record, or None when it is not known (any more)."""
         return next((record for record in self.tasks if record.id == task_id), None)
 
+
+RECORDERS = 20
+"""Most recorders remembered."""
+RECORDER_SILENT_S = 5.0
+"""A recorder tells of itself every second; without word for so long something is wrong with it."""
+SILENT = "silent"
 
 _EVENT_LEVELS = {RunEventKind.FAILED: "error", RunEventKind.PROGRESS: "debug", RunEventKind.PARTIAL: "debug"}
 
@@ -74,6 +83,7 @@ class Board:
         self._tasks: dict[str, TaskRecord] = {}
         self._entries: deque[Entry] = deque(maxlen=entries)
         self._serial = 0
+        self._recorders: dict[str, tuple[float, RecorderStatus]] = {}
 
     def take_task(self, record: TaskRecord) -> bool:
         """Take a task's record unless a later one is known; whether it was taken."""
@@ -95,6 +105,21 @@ class Board:
         """Take the answer to a question for all tasks."""
         for record in records:
             self.take_task(record)
+
+    def take_recorder(self, status: RecorderStatus, now: float) -> None:
+        """Take a recorder's account of itself, heard at `now` (monotonic seconds); one that stopped is forgotten."""
+        if status.state == "stopped":
+            self._recorders.pop(status.id, None)
+        elif status.id in self._recorders or len(self._recorders) < RECORDERS:
+            self._recorders[status.id] = (now, status)
+        self.revision += 1
+
+    def recorders(self, now: float) -> tuple[RecorderStatus, ...]:
+        """Return recorders by name, those not heard for a while as `silent`."""
+        return tuple(
+            status if now - heard_at < RECORDER_SILENT_S else structs.replace(status, state=SILENT)
+            for _, (heard_at, status) in sorted(self._recorders.items())
+        )
 
     def take_notice(self, notice: Notice) -> None:
         """Take a message to a person."""

@@ -18,8 +18,9 @@ from appliance.model import LogLine, Notice, Plan, RunEvent, TaskRecord, TaskReq
 from appliance.plane.node import PlaneClient
 from appliance.plane.session import Closer
 from appliance.plane.settings import PlaneConfig
+from appliance.record.facts import RecorderStatus
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
-from appliance.tui.board import Board, Connection, Snapshot
+from appliance.tui.board import SILENT, Board, Connection, Snapshot
 from appliance.tui.settings import TuiConfig
 
 log = structlog.get_logger(__name__)
@@ -116,6 +117,7 @@ class FleetView:
             robots=tuple(registry.robots[name] for name in sorted(registry.robots)),
             tasks=self.board.tasks,
             entries=self.board.entries,
+            recorders=self.board.recorders(time.monotonic()),
         )
 
     async def plan(self, instruction: str) -> PlanAnswer:
@@ -156,18 +158,24 @@ class FleetView:
     async def _keep(self) -> None:
         while True:
             try:
-                client = await PlaneClient.open(self._plane_config, fleet=self.fleet)
+                await self._keep_once()
             except SwiftbotError as error:
                 self._tell(Connection(problem=error.message, remedy=error.remedy or self._remedy()))
-                await asyncio.sleep(self.config.reconnect_s)
-                continue
-            try:
-                self._listen(client)
-                self._client = client
-                await self._watch(client)
-            finally:
-                self._client = None
-                await client.close()
+            except Exception as error:  # supervision boundary: the view must say that it no longer hears anything
+                log.exception("the view of the fleet failed")
+                self._tell(Connection(problem=f"internal error: {error!r}", remedy="trying again; see the log screen"))
+            await asyncio.sleep(self.config.reconnect_s)
+
+    async def _keep_once(self) -> None:
+        """One connection from its opening to its end."""
+        client = await PlaneClient.open(self._plane_config, fleet=self.fleet)
+        try:
+            self._listen(client)
+            self._client = client
+            await self._watch(client)
+        finally:
+            self._client = None
+            await client.close()
 
     def _listen(self, client: PlaneClient) -> None:
         keys, session = client.keys, client.session
@@ -176,6 +184,7 @@ class FleetView:
             session.subscribe_typed(keys.run(), RunEvent, self._on_run),
             session.subscribe_typed(keys.notice(), Notice, self._on_notice),
             session.subscribe_typed(keys.log(), LogLine, self._on_log),
+            session.subscribe_typed(keys.recorder_status(), RecorderStatus, self._on_recorder),
         ]
         client.registry.on_change.append(self._on_registry)
 
@@ -183,8 +192,13 @@ class FleetView:
         """Watch over one connection; returns when it is to be made anew."""
         silent_since = time.monotonic()
         asked_at = float("-inf")
+        silent: set[str] = set()
         while True:
             now = time.monotonic()
+            fell_silent = {status.id for status in self.board.recorders(now) if status.state == SILENT}
+            if fell_silent != silent:  # nothing was heard, so nothing else would have it drawn
+                silent = fell_silent
+                self._changes += 1
             if client.members():
                 silent_since = now
                 if not self._connection.connected:
@@ -240,6 +254,10 @@ class FleetView:
     def _on_log(self, _key: str, line: LogLine | None) -> None:
         if line is not None:
             self.board.take_log(line)
+
+    def _on_recorder(self, _key: str, status: RecorderStatus | None) -> None:
+        if status is not None:
+            self.board.take_recorder(status, time.monotonic())
 
     def _on_registry(self, _what: str) -> None:
         self._changes += 1

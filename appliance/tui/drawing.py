@@ -19,8 +19,9 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
+from appliance.record.facts import RecorderStatus
 from appliance.tasks.api import PlanAnswer
-from appliance.tui.board import Entry, Snapshot
+from appliance.tui.board import SILENT, Entry, Snapshot
 
 Row = tuple[Text, ...]
 Rows = dict[str, Row]
@@ -135,6 +136,22 @@ def gateway_notes(gateways: Iterable[GatewayStatus]) -> Text:
         if refused:
             kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(each.refused.items()))
             lines.append(Text(f"· {each.id}: {refused} bad inputs refused ({kinds})", "dim"))
+    return Text("\n").join(lines)
+
+
+def recorder_notes(recorders: Iterable[RecorderStatus]) -> Text:
+    """Return how the recorders are, a line each."""
+    lines: list[Text] = []
+    for each in recorders:
+        dropped = sum(each.dropped.values())
+        lost = f", {dropped} lost ({', '.join(sorted(each.dropped))})" if dropped else ""
+        if each.problem:
+            lines.append(Text(f"✘ recorder {each.id}: {each.problem}{lost}", "red"))
+        elif each.state == SILENT:
+            lines.append(Text(f"▲ recorder {each.id}: not heard any more; is `swiftbot record` running?", "yellow"))
+        else:
+            style = "yellow" if dropped else "dim"
+            lines.append(Text(f"✔ recorder {each.id}: {each.messages} messages in {each.file}{lost}", style))
     return Text("\n").join(lines)
 
 

@@ -100,7 +100,8 @@ class FleetPane(Pane):
         """Show a snapshot."""
         self.query_one("#gateways", DiffTable).show(self.filtered(drawing.gateway_rows(snapshot)))
         self.query_one("#robots", DiffTable).show(self.filtered(drawing.robot_rows(snapshot)))
-        notes = drawing.gateway_notes(snapshot.gateways)
+        parts = (drawing.gateway_notes(snapshot.gateways), drawing.recorder_notes(snapshot.recorders))
+        notes = Text("\n").join(part for part in parts if part)
         shown = self.query_one("#notes", Static)
         shown.display = bool(notes)
         shown.update(notes)

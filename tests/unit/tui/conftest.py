@@ -20,6 +20,7 @@ from appliance.model import (
     TaskState,
     Tier,
 )
+from appliance.record.facts import RecorderStatus
 from appliance.tasks.api import PlanAnswer
 from appliance.tui.board import Board, Connection, Snapshot
 
@@ -134,6 +135,7 @@ class FakeView:
             RobotInfo(id="rover-1", kind="zenoh", online=False, note="no heartbeat for 3 s"),
         )
         self.connection = Connection(connected=True)
+        self.recorders: tuple[RecorderStatus, ...] = ()
         self.changes = 0
         self.error: SwiftbotError | None = None
         self.planned: list[str] = []
@@ -164,6 +166,7 @@ class FakeView:
             robots=self.robots,
             tasks=self.board.tasks,
             entries=self.board.entries,
+            recorders=self.recorders,
         )
 
     def _fail(self) -> None:

@@ -10,6 +10,7 @@ from textual.widgets import Input
 
 from appliance.errors import PlanError, RefusedError, UnreachableError
 from appliance.model import GatewayStatus, Notice, TaskRecord, TaskState
+from appliance.record.facts import RecorderStatus
 from appliance.tui.actions import ACTIONS
 from appliance.tui.app import SwiftbotApp, export_picture
 from appliance.tui.board import Connection
@@ -51,6 +52,29 @@ async def test_fleet_is_shown_at_80_by_24(view: "FakeView") -> None:
         assert "test · 2 gw · 2 robots · 1 active" in text
     assert view.started
     assert view.closed
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [
+        (
+            RecorderStatus(id="r", fleet="t", state="recording", file="a.mcap", messages=7),
+            "✔ recorder r: 7 messages in",
+        ),
+        (
+            RecorderStatus(id="r", fleet="t", state="paused", problem="the disk is full", dropped={"disk full": 3}),
+            "✘ recorder r: the disk is full, 3 lost (disk full)",
+        ),
+        (RecorderStatus(id="r", fleet="t", state="silent"), "▲ recorder r: not heard any more"),
+    ],
+)
+async def test_recorder_is_shown(view: "FakeView", status: RecorderStatus, expected: str) -> None:
+    """Whether the recorder records, has lost something, or is gone, stands on the first screen."""
+    view.gateways = view.gateways[:1]
+    view.recorders = (status,)
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        assert expected in await settle(app, pilot)
 
 
 async def test_tasks_are_shown_with_the_plan_graph(view: "FakeView") -> None:

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import Plan, RunEvent, RunEventKind, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
+from appliance.record.facts import RecorderStatus
 from appliance.tui import drawing
 from appliance.tui.board import Board
 
@@ -94,3 +95,17 @@ def test_lines_are_one_line_each() -> None:
     board.add(1, kind="log", level="info", source="x", text="a\nb" + "c" * 9000)
     assert board.entries[0].text.startswith("a b")
     assert len(board.entries[0].text) == 500
+
+
+def test_recorder_falls_silent() -> None:
+    """A recorder not heard for a while is silent, one that stopped is forgotten, and only so many are believed."""
+    board = Board(tasks=1, entries=1)
+    for number in range(50):
+        board.take_recorder(RecorderStatus(id=f"r{number}", fleet="f", state="recording"), now=100.0)
+    assert len(board.recorders(100.0)) == 20
+    board.take_recorder(RecorderStatus(id="r1", fleet="f", state="recording"), now=104.0)
+    board.take_recorder(RecorderStatus(id="r2", fleet="f", state="stopped"), now=104.0)
+    states = {status.id: status.state for status in board.recorders(106.0)}
+    assert states["r0"] == "silent"
+    assert states["r1"] == "recording"
+    assert "r2" not in states
