@@ -32,8 +32,8 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Below it the next tier is asked; the slot's margins are not calibrated for every model, so not too strict."""
     local_max_words: int = 150
     """Longer instructions go straight to the next tier: small models lose track in long ones."""
-    local_max_tokens: int = 2048
-    """Bound of prompt and answer together."""
+    local_max_tokens: int = 8192
+    """Bound of prompt and answer together; the catalogue alone takes some 2,500. The model's own context is a bound too."""
     local_threads: int = 0
     """Threads of the slot; 0: as the model's configuration says. Two help prefill, one is as good for decoding."""
 

@@ -1,0 +1,254 @@
+"""The model's own process: loads an onnxruntime-genai folder and answers prompts under a grammar.
+
+Why a process: the library holds Python's lock while it computes (half a second for a long prompt), and a gateway that
+stalls that long loses its leases; and a model that crashes or eats memory must not take the gateway along. Run as
+`python -m appliance.llm.slot FOLDER`, frames on stdin and stdout (`frames`). It ends when stdin ends.
+
+What is kept between prompts: the generator with the tokens it has seen. The next prompt rewinds to the longest common
+prefix, which is the fixed part with the catalogue, so that only the instruction is computed anew. A generator belongs
+to one grammar; the grammar changes when the roster does.
+"""
+
+import json
+import math
+import os
+import re
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from appliance.llm import frames
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_NEEDED = ("genai_config.json",)
+_SPARE = 64
+"""Tokens that must be left for an answer."""
+_SKILL = re.compile(r'"skill":"([a-z0-9_]*)$')
+_ROBOT = re.compile(r'"robot":("[a-z0-9_.-]*)?$')
+_AFTER = re.compile(r'"after":\[((?:"s\d+",)*)("s?\d*)?$')
+_NEXT = re.compile(r'"after":\[(?:"s\d+",)*"s\d+"$')
+_INDEX = re.compile(r'"id":"s(\d+)"')
+
+
+class SlotError(Exception):
+    """Something that cannot be done, with code and remedy as the gateway's errors have them."""
+
+    def __init__(self, code: str, message: str, remedy: str = "") -> None:
+        super().__init__(message)
+        self.code = code
+        self.message = message
+        self.remedy = remedy
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be a model, before the library says it in its own words."""
+    remedy = "set llm.local_model to an onnxruntime-genai folder, or leave it empty"
+    if not folder.is_dir():
+        raise SlotError("prerequisite", f"there is no model folder {folder}", remedy)
+    for name in _NEEDED:
+        if not (folder / name).is_file():
+            raise SlotError("prerequisite", f"model folder {folder} has no {name}", remedy)
+
+
+class Slot:
+    """One loaded model."""
+
+    def __init__(self, folder: Path, *, threads: int = 0, max_tokens: int = 8192) -> None:
+        check_folder(folder)
+        try:
+            config_text = json.loads((folder / "genai_config.json").read_text(encoding="utf-8"))
+            context = int(config_text["model"]["context_length"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise SlotError(
+                "prerequisite", f"{folder}/genai_config.json is damaged: {error!r}", "copy the model folder again"
+            ) from error
+        import onnxruntime_genai as og  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
+
+        self._og: Any = og
+        try:
+            config: Any = og.Config(str(folder))  # pyright: ignore[reportUnknownMemberType]
+            if threads:
+                options = {"model": {"decoder": {"session_options": {"intra_op_num_threads": threads}}}}
+                config.overlay(json.dumps(options))
+            self._model: Any = og.Model(config)
+            self._tokenizer: Any = og.Tokenizer(self._model)
+        except Exception as error:
+            # The library raises bare RuntimeErrors for whatever is wrong with the files.
+            raise SlotError(
+                "prerequisite",
+                f"model folder {folder} cannot be loaded: {str(error)[:300]}",
+                "copy the folder again; it must be made for onnxruntime-genai",
+            ) from error
+        self._limit = min(max_tokens, context)
+        self._generator: Any = None
+        self._key = ""
+        self._seen: list[int] = []
+        self._pieces: dict[str, list[int]] = {}
+        self._vocabulary = int(config_text["model"].get("vocab_size", 0))
+
+    def propose(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Answer a chat under a grammar.
+
+        Args:
+            request: `messages`, `grammar`, `choices` (skill and robot names, for the confidence), `deadline_s`.
+
+        Returns:
+            `text`, `confidence` (0 to 1, of the least sure decision), `tokens`, `reused` prompt tokens, `ms`.
+        """
+        began = time.monotonic()
+        prompt = [int(token) for token in self._tokenizer.encode(self._render(request["messages"]))]
+        if len(prompt) + _SPARE > self._limit:
+            raise SlotError(
+                "plan",
+                f"the prompt has {len(prompt)} tokens: the local model may use {self._limit}",
+                "raise llm.local_max_tokens, or use a model with a longer context",
+            )
+        reused = self._feed(prompt, str(request["grammar"]))
+        try:
+            text, confidence = self._generate(request.get("choices") or {}, began + float(request["deadline_s"]))
+        except BaseException:
+            self._generator = None
+            raise
+        elapsed = 1000 * (time.monotonic() - began)
+        return {
+            "text": text,
+            "confidence": confidence,
+            "tokens": len(self._seen) - len(prompt),
+            "reused": reused,
+            "ms": elapsed,
+        }
+
+    def _render(self, messages: "Sequence[dict[str, str]]") -> str:
+        try:
+            return str(self._tokenizer.apply_chat_template(json.dumps(messages), add_generation_prompt=True))
+        except Exception:  # noqa: BLE001 - the library raises bare errors for a model without chat template
+            return "".join(f"### {each['role']}\n{each['content']}\n" for each in messages) + "### assistant\n"
+
+    def _feed(self, prompt: list[int], grammar: str) -> int:
+        """Compute the prompt, reusing what the last one shares with it; return how many tokens that was."""
+        common = 0
+        if self._generator is not None and self._key == grammar:
+            shared = min(len(prompt) - 1, len(self._seen))
+            while common < shared and prompt[common] == self._seen[common]:
+                common += 1
+        try:
+            if common:
+                self._generator.rewind_to(common)
+            else:
+                params = self._og.GeneratorParams(self._model)
+                params.set_search_options(max_length=self._limit, do_sample=False)
+                params.set_guidance("lark_grammar", grammar, False)
+                self._generator = self._og.Generator(self._model, params)
+                self._key = grammar
+            self._generator.append_tokens(prompt[common:])
+        except Exception as error:
+            self._generator = None
+            raise SlotError("internal", f"the local model failed on the prompt: {str(error)[:300]}") from error
+        self._seen = list(prompt)
+        return common
+
+    def _generate(self, choices: dict[str, Any], deadline: float) -> tuple[str, float]:
+        stream = self._tokenizer.create_stream()
+        text = ""
+        sure = 1.0
+        while not self._generator.is_done():
+            if time.monotonic() > deadline:
+                raise SlotError("deadline", "the local model did not end in time", "raise llm.local_deadline_s")
+            open_choice = self._open(text, choices)
+            logits = self._generator.get_logits() if open_choice else None
+            self._generator.generate_next_token()
+            token = int(self._generator.get_next_tokens()[0])
+            self._seen.append(token)
+            if logits is not None and (share := self._share(logits.reshape(-1), open_choice, token)) is not None:
+                sure = min(sure, share)
+            text += str(stream.decode(token))
+        return text, sure
+
+    def _open(self, text: str, choices: dict[str, Any]) -> list[str]:
+        """Return how the text may go on where it decides something; empty elsewhere."""
+        tail = text[-400:]
+        if match := _SKILL.search(tail):
+            return [
+                f'{name}","robot":'[len(match[1]) :] for name in choices.get("skill", ()) if name.startswith(match[1])
+            ]
+        if match := _ROBOT.search(tail):
+            said = match[1] or ""
+            quoted = [f'"{name}","params":' for name in choices.get("robot") or ()]
+            return [each[len(said) :] for each in quoted if each.startswith(said)]
+        index = max((int(found) for found in _INDEX.findall(tail)[-1:]), default=1)
+        earlier = [f'"s{number}"' for number in range(1, index)]
+        if match := _AFTER.search(tail):
+            said = match[2] or ""
+            options = [*([] if match[1] or said else ["]"]), *earlier]
+            return [each[len(said) :] for each in options if each.startswith(said) and len(each) > len(said)]
+        return [",", "]"] if _NEXT.search(tail) else []
+
+    def _share(self, logits: Any, options: list[str], token: int) -> float | None:
+        """Return the probability of the token among those that could have stood there; None if it was forced."""
+        pieces = self._vocabulary_pieces()
+        allowed = {
+            each for option in options for end in range(1, len(option) + 1) for each in pieces.get(option[:end], ())
+        }
+        if token not in allowed or len(allowed) < 2 or len(options) < 2:
+            return None
+        values = {each: float(logits[each]) for each in allowed}
+        top = max(values.values())
+        total = sum(math.exp(value - top) for value in values.values())
+        share = math.exp(values[token] - top) / total
+        return share if math.isfinite(share) else 0.0
+
+    def _vocabulary_pieces(self) -> dict[str, list[int]]:
+        """Return text -> tokens of it, for the plain ones; made when first needed."""
+        if not self._pieces:
+            for token in range(self._vocabulary):
+                try:
+                    piece = str(self._tokenizer.decode([token]))
+                except Exception:  # noqa: BLE001, S112 - ids without text: the library raises bare errors
+                    continue
+                if piece and piece.isascii():
+                    self._pieces.setdefault(piece, []).append(token)
+        return self._pieces
+
+
+def serve(folder: Path, requests: BinaryIO, replies: BinaryIO, *, threads: int, max_tokens: int) -> int:
+    """Load the model and answer until the requests end; return the exit status."""
+    began = time.monotonic()
+    try:
+        slot = Slot(folder, threads=threads, max_tokens=max_tokens)
+    except SlotError as error:
+        frames.write(replies, {"error": {"code": error.code, "message": error.message, "remedy": error.remedy}})
+        return 5
+    frames.write(replies, {"ready": True, "ms": 1000 * (time.monotonic() - began)})
+    while (request := frames.read(requests)) is not None:
+        reply: dict[str, Any] = {"id": request.get("id")}
+        try:
+            reply |= slot.propose(request)
+        except SlotError as error:
+            reply["error"] = {"code": error.code, "message": error.message, "remedy": error.remedy}
+        except Exception as error:  # noqa: BLE001 - supervision boundary: named to the gateway, the slot lives on
+            reply["error"] = {"code": "internal", "message": f"the local model failed: {error!r}"[:400], "remedy": ""}
+        frames.write(replies, reply)
+    return 0
+
+
+def main() -> int:
+    """Entry of the process: `slot.py FOLDER [THREADS [MAX_TOKENS]]`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the gateway ends it, not the terminal
+    # Libraries print where they like; the frames keep a descriptor of their own.
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    arguments = sys.argv[1:]
+    threads = int(arguments[1]) if len(arguments) > 1 else 0
+    max_tokens = int(arguments[2]) if len(arguments) > 2 else 8192
+    try:
+        return serve(Path(arguments[0]), sys.stdin.buffer, replies, threads=threads, max_tokens=max_tokens)
+    except BrokenPipeError:
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

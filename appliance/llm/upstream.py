@@ -1,0 +1,224 @@
+"""The upstream tier: any server that speaks OpenAI's chat completions, in the building or elsewhere.
+
+Servers differ in what `response_format` they take, so a refused `json_schema` falls back to `json_object`, and that
+to none; what worked is remembered. Failures are sorted by what helps: an answer 429 or 5xx, or no connection, is tried
+again within bounds; a refused key or an unknown model is not. The key is read anew for each request, so that a new one
+needs no restart, and it is never part of a message or a log line.
+"""
+
+import asyncio
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import structlog
+from msgspec import Struct, field
+
+from appliance.errors import ConfigError, DeadlineError, PayloadError, SwiftbotError, UnreachableError
+from appliance.llm.prompt import messages
+from appliance.llm.schema import MAX_ANSWER_BYTES, plan_schema, read_plan
+from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.tier import Proposal
+from appliance.model import Plan, Tier
+from appliance.skills.catalogue import Catalogue
+
+if TYPE_CHECKING:
+    import httpx
+
+log = structlog.get_logger(__name__)
+
+_FORMATS = ("json_schema", "json_object", "none")
+_UNSURE = 0.9
+"""Confidence in a valid plan from a server that tells no log-probabilities."""
+_PAUSE_S = 0.5
+_CONNECT_S = 3.0
+
+
+class _Token(Struct):
+    token: str = ""
+    logprob: float = 0.0
+
+
+class _Logprobs(Struct):
+    content: list[_Token] | None = None
+
+
+class _Message(Struct):
+    content: str | None = None
+
+
+class _Choice(Struct):
+    message: _Message = field(default_factory=_Message)
+    finish_reason: str | None = None
+    logprobs: _Logprobs | None = None
+
+
+class _Completion(Struct):
+    choices: list[_Choice]
+
+
+class UpstreamTier:
+    """Plans by a larger model behind an OpenAI-compatible `/chat/completions`."""
+
+    name = Tier.UPSTREAM
+    repairs = True
+
+    def __init__(self, config: LlmConfig, catalogue: Catalogue) -> None:
+        self._config = config
+        self._catalogue = catalogue
+        self._client: httpx.AsyncClient | None = None
+        self._format = 0
+        self._url = config.upstream_url.rstrip("/") + "/chat/completions"
+
+    async def start(self) -> None:
+        """Nothing is sent before the first instruction."""
+
+    async def close(self) -> None:
+        """Close the connections."""
+        if self._client is not None:
+            await self._client.aclose()
+            self._client = None
+
+    async def propose(
+        self, context: PlanContext, *, previous: Plan | None = None, problems: tuple[str, ...] = ()
+    ) -> Proposal:
+        """Ask the server for a plan.
+
+        Raises:
+            UnreachableError: no connection, or the server keeps failing.
+            DeadlineError: it does not answer in time.
+            ConfigError: it refuses the key, the address or the model.
+            PayloadError: its answer is no chat completion.
+            PlanError: its answer is no plan.
+        """
+        chat = messages(context, self._catalogue, previous=previous, problems=problems)
+        answer = await self._ask(chat)
+        choice = answer.choices[0] if answer.choices else _Choice()
+        if choice.finish_reason == "length":
+            raise PayloadError(
+                "the upstream model's answer was cut off",
+                remedy="raise llm.upstream_max_tokens, or give the order in parts",
+            )
+        plan = read_plan(choice.message.content or "", tier=Tier.UPSTREAM)
+        return Proposal(plan=plan, confidence=_confidence(choice.logprobs))
+
+    async def _ask(self, chat: list[dict[str, str]]) -> _Completion:
+        tries = 0
+        while True:
+            try:
+                status, body = await self._post(chat)
+            except (UnreachableError, DeadlineError) as error:
+                failure: SwiftbotError = error
+            else:
+                if status == 200:
+                    return _decode(body)
+                if status in (400, 422) and self._format < len(_FORMATS) - 1:
+                    log.info("upstream refuses the response format", refused=_FORMATS[self._format], status=status)
+                    self._format += 1
+                    continue
+                failure = self._refusal(status, body)
+                if status != 429 and status < 500:
+                    raise failure
+            if tries >= self._config.upstream_retries:
+                raise failure
+            tries += 1
+            await asyncio.sleep(_PAUSE_S * 2 ** (tries - 1))
+
+    async def _post(self, chat: list[dict[str, str]]) -> tuple[int, bytes]:
+        import httpx  # noqa: PLC0415 - loading it costs memory that a gateway without upstream keeps
+
+        if self._client is None:
+            limit = self._config.upstream_deadline_s
+            self._client = httpx.AsyncClient(timeout=httpx.Timeout(limit, connect=min(_CONNECT_S, limit)))
+        headers = {"content-type": "application/json", **self._key()}
+        content = msgspec.json.encode(self._body(chat))
+        body = bytearray()
+        try:
+            async with self._client.stream("POST", self._url, content=content, headers=headers) as response:
+                async for part in response.aiter_bytes():
+                    body += part
+                    if len(body) > 4 * MAX_ANSWER_BYTES:
+                        raise PayloadError(
+                            f"the upstream server's answer is longer than {4 * MAX_ANSWER_BYTES} bytes",
+                            remedy="check that llm.upstream_url is a chat completions server",
+                        )
+                return response.status_code, bytes(body)
+        except httpx.TimeoutException as error:
+            raise DeadlineError(
+                f"the upstream server {self._url} did not answer in time",
+                remedy="raise llm.upstream_deadline_s, or see its load",
+            ) from error
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            raise UnreachableError(
+                f"the upstream server {self._url} cannot be reached: {type(error).__name__}: {str(error)[:120]}",
+                remedy="check llm.upstream_url and the network",
+            ) from error
+
+    def _key(self) -> dict[str, str]:
+        if not self._config.upstream_key_file:
+            return {}
+        try:
+            key = Path(self._config.upstream_key_file).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"llm.upstream_key_file {self._config.upstream_key_file} cannot be read: {error}",
+                remedy="write the key to it",
+            ) from error
+        if not key.isascii() or not key.isprintable() or " " in key:
+            raise ConfigError(
+                f"llm.upstream_key_file {self._config.upstream_key_file} does not hold a key",
+                remedy="one line, the key alone",
+            )
+        return {"authorization": f"Bearer {key}"} if key else {}
+
+    def _body(self, chat: list[dict[str, str]]) -> dict[str, Any]:
+        body: dict[str, Any] = {
+            "model": self._config.upstream_model,
+            "messages": chat,
+            "temperature": 0,
+            "max_tokens": self._config.upstream_max_tokens,
+            "stream": False,
+        }
+        form = _FORMATS[self._format]
+        if form == "json_schema":
+            # Not strict: strict servers take no optional properties, and a plan leaves out what was not said.
+            schema = {"name": "plan", "strict": False, "schema": plan_schema(self._catalogue)}
+            body |= {"logprobs": True, "response_format": {"type": form, "json_schema": schema}}
+        elif form == "json_object":
+            body["response_format"] = {"type": form}
+        return body
+
+    def _refusal(self, status: int, body: bytes) -> SwiftbotError:
+        said = body[:200].decode(errors="replace").strip()
+        if status in (401, 403):
+            return ConfigError(f"the upstream server refuses the key ({status})", remedy="check llm.upstream_key_file")
+        if status == 404:
+            return ConfigError(
+                f"the upstream server knows no {self._url} or no model {self._config.upstream_model!r}: {said!r}",
+                remedy="check llm.upstream_url (it ends in /v1) and llm.upstream_model",
+            )
+        if status == 429 or status >= 500:
+            return UnreachableError(
+                f"the upstream server answers {status}: {said!r}", remedy="see its log, try again later"
+            )
+        return PayloadError(f"the upstream server answers {status}: {said!r}", remedy="see its log")
+
+
+def _decode(body: bytes) -> _Completion:
+    try:
+        return msgspec.json.decode(body, type=_Completion)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise PayloadError(
+            f"the upstream server's answer is no chat completion: {str(error)[:160]}",
+            remedy="check that llm.upstream_url is an OpenAI-compatible server",
+        ) from error
+
+
+def _confidence(logprobs: _Logprobs | None) -> float:
+    """Return how sure the model was: its mean probability over the tokens that were no foregone conclusion."""
+    tokens = [each.logprob for each in (logprobs.content or ())] if logprobs is not None else []
+    open_ones = [value for value in tokens if math.isfinite(value) and value < -0.01]
+    if not tokens:
+        return _UNSURE
+    return math.exp(sum(open_ones) / len(open_ones)) if open_ones else 1.0
