@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .SILENT:
 .NOTPARALLEL:
-.PHONY: help setup demo test check lint types contracts unit format lock images install uninstall clean ready
+.PHONY: help setup demo test check lint formatted types contracts unit format lock images install uninstall clean ready
 
 # Taken as it is, without make expanding "$", and given on in the environment: any text may stand in it.
 override ASK := $(value ASK)
@@ -26,18 +26,20 @@ demo: setup ## Start a fleet, run instructions on it, replay its log
 
 test: ## Set up and run everything: lint, types, import contracts, unit, integration and replay tests
 	scripts/setup.sh dev
-	$(MAKE) --no-print-directory lint types contracts READY=1
+	$(MAKE) --no-print-directory lint formatted types contracts READY=1
 	$(PYTEST) tests
 
 check: ready ## The fast part: lint, types, import contracts, unit tests
-	$(MAKE) --no-print-directory lint types contracts unit READY=1
+	$(MAKE) --no-print-directory lint formatted types contracts unit READY=1
 
 ready:
 	$(if $(READY),:,scripts/setup.sh dev --without-images)
 
-lint: ready ## Ruff: rules and format
+lint: ready ## Ruff: rules
 	$(RUN) ruff check --quiet .
-	$(RUN) ruff format --check --quiet . || { echo 'lint: not formatted (make format)' >&2; exit 1; }
+
+formatted: ready ## Ruff: format, checked only
+	$(RUN) ruff format --check --quiet . || { echo 'not formatted: make format' >&2; exit 1; }
 
 types: ready ## Basedpyright, strict
 	$(RUN) basedpyright --level error

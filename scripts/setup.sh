@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Makes this machine able to run the appliance, from nothing but git, make and Python 3.11 on Debian.
 #
-#   scripts/setup.sh [gateway|dev] [--without-images]
+#   scripts/setup.sh [gateway|dev|host] [--without-images]
 #
-# gateway: what a gateway and the demo need. dev: that, and the tools of `make test`.
+# gateway: what a gateway and the demo need. dev: that, and the tools of `make test`. host: only the machine's part
+# (packages, user, ranges, Podman), for `make install`, which puts the program elsewhere.
 # As root it sets up the service user and works for it; as a user it works in place and asks sudo for system packages
 # and id ranges only. What is there already is kept: a second run takes about a second. docs/operations.md tells more.
 set -euo pipefail
@@ -15,10 +16,10 @@ MODE=gateway
 IMAGES=1
 for argument in "$@"; do
   case $argument in
-    gateway | dev) MODE=$argument ;;
+    gateway | dev | host) MODE=$argument ;;
     --without-images) IMAGES= ;;
     *)
-      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev] [--without-images])" >&2
+      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images])" >&2
       exit 2
       ;;
   esac
@@ -404,9 +405,14 @@ give_ranges
 make_runtime_dir
 configure_storage
 configure_engine
-copy_tree
-make_environment
-install_package
-start_api
-if [ -n "$IMAGES" ]; then build_images; fi
+if [ "$MODE" = host ]; then
+  make_tools
+  start_api
+else
+  copy_tree
+  make_environment
+  install_package
+  start_api
+  if [ -n "$IMAGES" ]; then build_images; fi
+fi
 say "ready ($MODE, user $RUN_USER)"
