@@ -542,6 +542,8 @@ def startup(*, count: int = 100, cold: int = 5, as_json: Json = False) -> int:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: run a command and end with its exit code."""
+    # Commands speak for themselves; daemons set up their own logging when they start.
+    logs.configure(level="warning", style="text")
     try:
         code = app(arguments, exit_on_error=False, print_error=True, result_action="return_value")
         code = code if isinstance(code, int) else 0

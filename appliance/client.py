@@ -5,17 +5,25 @@ It sits anywhere on the Zenoh network, asks any gateway, and knows nothing of a 
 
 import asyncio
 import contextlib
+import time
+import uuid
 from collections.abc import AsyncIterator
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
 from appliance.model import Notice, RunEvent, TaskRecord, TaskRequest, TaskState
 from appliance.plane.node import PlaneClient
 from appliance.plane.settings import PlaneConfig
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+
+R = TypeVar("R", bound=Struct)
+
+PATIENCE_S = 6.0
+"""How long another gateway is looked for when the one that was asked is gone: detection takes a second."""
 
 
 class Endpoint(Struct, frozen=True, kw_only=True):
@@ -62,26 +70,38 @@ class FleetClient:
         """Any gateway that is present; UnreachableError when there is none."""
         return await self.plane.any_gateway()
 
+    async def _ask(self, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0) -> R:
+        """Ask any gateway, and another one when it dies meanwhile: every verb used here may be repeated."""
+        give_up = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return await self.plane.rpc.call(await self.gateway(), verb, request, reply, timeout_s=timeout_s)
+            except UnreachableError:
+                if time.monotonic() > give_up:
+                    raise
+                await asyncio.sleep(0.1)
+
     async def plan(self, instruction: str) -> PlanAnswer:
         """Decompose, run nothing."""
-        ask = PlanAsk(instruction=instruction)
-        return await self.plane.rpc.call(await self.gateway(), "plan", ask, PlanAnswer, timeout_s=60.0)
+        return await self._ask("plan", PlanAsk(instruction=instruction), PlanAnswer, timeout_s=60.0)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
-        """Hand in a task; durable when this returns."""
-        return await self.plane.rpc.call(await self.gateway(), "submit", request, TaskRecord, timeout_s=10.0)
+        """Hand in a task; durable when this returns. It gets its id here, so that asking twice is one task."""
+        if not request.id:
+            request = replace(request, id=f"t-{uuid.uuid4().hex[:10]}")
+        return await self._ask("submit", request, TaskRecord, timeout_s=10.0)
 
     async def task(self, task: str) -> TaskRecord:
         """One task's record."""
-        return await self.plane.rpc.call(await self.gateway(), "task", TaskAsk(id=task), TaskRecord)
+        return await self._ask("task", TaskAsk(id=task), TaskRecord)
 
     async def tasks(self, limit: int) -> TaskList:
         """The newest tasks of the fleet."""
-        return await self.plane.rpc.call(await self.gateway(), "tasks", TasksAsk(limit=limit), TaskList)
+        return await self._ask("tasks", TasksAsk(limit=limit), TaskList)
 
     async def cancel(self, task: str) -> TaskRecord:
         """Stop a task."""
-        return await self.plane.rpc.call(await self.gateway(), "cancel", TaskAsk(id=task), TaskRecord)
+        return await self._ask("cancel", TaskAsk(id=task), TaskRecord)
 
     async def watch(self, task: str, *, poll_s: float = 1.0) -> AsyncIterator[TaskRecord]:
         """Yield a task's record whenever it changes, until it has ended; survives the loss of gateways.

@@ -21,7 +21,14 @@ from msgspec import Struct
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
-from appliance.errors import ConfigError, DeadlineError, NotFoundError, PrerequisiteError, SwiftbotError, UnreachableError
+from appliance.errors import (
+    ConfigError,
+    DeadlineError,
+    NotFoundError,
+    PrerequisiteError,
+    SwiftbotError,
+    UnreachableError,
+)
 from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
