@@ -82,6 +82,7 @@ if [ -n "$DESTDIR" ]; then
   exit 0
 fi
 
+locate_runtime_dir || die "there is no user $RUN_USER" "see what 'scripts/setup.sh host' says"
 say "images"
 (cd / && as_user /opt/swiftbot/venv/bin/swiftbot images build) | sed -u 's/^/    /' ||
   die "images" "see the lines above; then: sudo make install"
