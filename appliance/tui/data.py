@@ -193,17 +193,20 @@ class FleetView:
         silent_since = time.monotonic()
         asked_at = float("-inf")
         silent: set[str] = set()
+        members: frozenset[str] = frozenset()
         while True:
             now = time.monotonic()
             fell_silent = {status.id for status in self.board.recorders(now) if status.state == SILENT}
             if fell_silent != silent:  # nothing was heard, so nothing else would have it drawn
                 silent = fell_silent
                 self._changes += 1
-            if client.members():
+            if client.members() != members:
+                # Gateways came or went, perhaps the one that this connection hung on: pushes may have been missed.
+                members = client.members()
+                asked_at = float("-inf")
+            if members:
                 silent_since = now
-                if not self._connection.connected:
-                    asked_at = float("-inf")
-                    self._tell(Connection(connected=True))
+                self._tell(Connection(connected=True))
                 if now - asked_at >= self.config.resync_s:
                     asked_at = now
                     await self._resync()

@@ -45,17 +45,18 @@ CONFIG = TuiConfig(refresh_hz=10.0, reconnect_s=0.2, silence_s=1.0, resync_s=5.0
 class Gateway:
     """A gateway as the terminal UI sees one: token, status, and the verbs `plan`, `submit`, `tasks`, `cancel`."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, name: str = "gw-a") -> None:
         self.session = session
+        self.name = name
         self.keys = session.keys
         self.submitted: list[TaskRequest] = []
         self.cancelled: list[str] = []
-        self._rpc = Rpc(session, "gw-a")
+        self._rpc = Rpc(session, name)
         self._rpc.register("plan", PlanAsk, self._plan)
         self._rpc.register("submit", TaskRequest, self._submit)
         self._rpc.register("tasks", TasksAsk, self._tasks)
         self._rpc.register("cancel", TaskAsk, self._cancel)
-        self._token = session.declare_alive(self.keys.alive("gw-a"))
+        self._token = session.declare_alive(self.keys.alive(name))
         self._beat = asyncio.create_task(self._run())
 
     async def _plan(self, ask: PlanAsk) -> PlanAnswer:
@@ -77,11 +78,11 @@ class Gateway:
         return TaskRecord(id=ask.id, instruction="x", state=TaskState.CANCELLING, created_ns=2, sequence=9)
 
     async def _run(self) -> None:
-        status = GatewayStatus(id="gw-a", fleet="f1", load=0.25, containers=1, ready=1, limits_enforced=False)
-        container = ContainerInfo(id="c-one", gateway="gw-a", image="base", state=ContainerState.READY)
+        status = GatewayStatus(id=self.name, fleet="f1", load=0.25, containers=1, ready=1, limits_enforced=False)
+        container = ContainerInfo(id="c-one", gateway=self.name, image="base", state=ContainerState.READY)
         while True:
-            self.session.put(self.keys.status("gw-a"), encode(status))
-            self.session.put(self.keys.container("gw-a", "c-one"), encode(container))
+            self.session.put(self.keys.status(self.name), encode(status))
+            self.session.put(self.keys.container(self.name, "c-one"), encode(container))
             self.session.put(self.keys.robot("r1"), encode(RobotInfo(id="r1", kind="zenoh")))
             await asyncio.sleep(0.1)
 
@@ -201,6 +202,29 @@ async def test_lost_gateway_comes_back(app: SwiftbotApp, free_port: int) -> None
         second = await _gateway(free_port)
         await _see(app, pilot, "gw-a", lambda text: "swiftbot up" not in text)
         await second.close()
+
+
+async def test_the_gateway_it_hangs_on_dies(free_ports: Callable[..., list[int]]) -> None:
+    """When the gateway that carries the connection dies, the next one does: the UI goes on and a task is accepted."""
+    ports = free_ports(2)
+    first, second = (f"tcp/127.0.0.1:{port}" for port in ports)
+    one = Gateway(await Session.open(PlaneConfig(listen=(first,)), "f1"), "gw-a")
+    two = Gateway(await Session.open(PlaneConfig(listen=(second,), connect=(first,)), "f1"), "gw-b")
+    plane = PlaneConfig(mode="client", connect=(first, second), connect_timeout_s=0.5)
+    app = SwiftbotApp(FleetView(plane, "f1", CONFIG), CONFIG)
+    try:
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _see(app, pilot, "gw-a", "gw-b", "2 gw")
+            await one.close()
+            await _see(app, pilot, "gw-b", "1 gw", lambda text: "swiftbot up" not in text)
+            await pilot.press("s", *"walk", "enter")
+            await _see(app, pilot, "Enter runs this plan")
+            await pilot.press("enter")
+            await _see(app, pilot, "walk", "accepted")
+            assert len(two.submitted) == 1
+    finally:
+        await one.close()
+        await two.close()
 
 
 def test_own_log_lines_go_to_the_log_screen(free_port: int) -> None:

@@ -154,6 +154,32 @@ def test_rotation_by_time_and_by_channels(tmp_path: Path) -> None:
     assert [len(info(path).channels) for path in writer.files] == [1, 3, 3]
 
 
+def test_flushed_when_due(tmp_path: Path) -> None:
+    """After half a second a message is in a whole chunk on the disk, synced, while the file is still open."""
+    clock = Clock()
+    synced: list[Path] = []
+
+    class Synced(LogFile):
+        def sync(self) -> None:
+            synced.append(self.path)
+
+    config = RecordConfig(directory=str(tmp_path), free_bytes=0)
+    writer = LogWriter(config, fleet="f1", clock=clock, open_file=Synced)
+    writer.write(_message(0))
+    clock.now += 0.4
+    writer.tick()
+    assert _numbers(writer.files) == []
+    clock.now += 0.2
+    writer.tick()
+    assert _numbers(writer.files) == [0]
+    assert info(writer.files[0]).recovered
+    assert synced == writer.files
+    clock.now += 0.6
+    writer.tick()  # nothing new: the disk is left alone
+    assert len(synced) == 1
+    writer.close()
+
+
 def test_two_starts_in_a_second_make_two_files(tmp_path: Path) -> None:
     """A file that is there is never written over."""
     first, second = _writer(tmp_path), _writer(tmp_path)
