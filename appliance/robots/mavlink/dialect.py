@@ -56,8 +56,8 @@ class Codec:
     def read(self, data: bytes) -> Iterator[Frame | Damage]:
         """Yield what a datagram (or a piece of a log) holds, in order; never raises, consumes every byte.
 
-        After a damaged frame the search goes on behind it when another frame or the end is there, else at the
-        next marker byte, so that one flipped length byte does not cost the frames that follow.
+        After a damaged frame the search goes on at the first good frame that begins within it (its length may be
+        what was damaged), else behind it, so that one flipped byte costs one frame.
         """
         at = 0
         while at < len(data):
@@ -73,11 +73,26 @@ class Codec:
                 at = following
                 continue
             result = self._decode(data[at : at + length])
-            if isinstance(result, Damage) and at + length < len(data) and data[at + length] not in (253, 254):
-                length = _next_marker(data, at + 1) - at
+            if isinstance(result, Damage):
+                length = self._resume(data, at, length) - at
                 result = Damage(result.kind, length)
             yield result
             at += length
+
+    def _resume(self, data: bytes, at: int, length: int) -> int:
+        """Return where to go on after a damaged frame of that announced length."""
+        inner = _next_marker(data, at + 1)
+        while inner < at + length:
+            size = frame_length(data, inner)
+            if (
+                size is not None
+                and inner + size <= len(data)
+                and isinstance(self._decode(data[inner : inner + size]), Frame)
+            ):
+                return inner
+            inner = _next_marker(data, inner + 1)
+        behind = at + length
+        return behind if behind == len(data) or data[behind] in (MARKER_V1, MARKER_V2) else inner
 
     def _decode(self, raw: bytes) -> Frame | Damage:
         if raw[0] == MARKER_V2 and raw[2] & ~_SIGNED:

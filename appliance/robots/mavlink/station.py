@@ -20,7 +20,7 @@ from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.copter import Copter
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.endpoint import Endpoint
-from appliance.robots.mavlink.vehicle import Vehicle
+from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 
 log = structlog.get_logger(__name__)
@@ -153,9 +153,7 @@ class Station:
         if frame.system == self._config.system_id or name is None or known >= self._config.max_vehicles:
             self._count("unknown_system")
             return None
-        if frame.name != "HEARTBEAT" or (
-            frame.message.autopilot == dialect.AUTOPILOT_NONE or frame.message.type == dialect.TYPE_GROUND_STATION
-        ):
+        if not is_autopilot(frame):
             self._count("unknown_system")
             return None
         if name in self._vehicles or name in self._others:

@@ -22,6 +22,18 @@ MAX_WAITING = 256
 """Messages kept for one waiter; older ones are dropped, as on a radio link."""
 
 
+def is_autopilot(frame: Frame) -> bool:
+    """Tell whether a frame is the heartbeat of an autopilot: not of a camera, a gimbal or a ground station.
+
+    Components share their vehicle's system id and beat too; the first one heard is often not the autopilot.
+    """
+    return (
+        frame.name == "HEARTBEAT"
+        and frame.message.autopilot != dialect.AUTOPILOT_NONE
+        and frame.message.type != dialect.TYPE_GROUND_STATION
+    )
+
+
 class Vehicle:
     """One vehicle. `send` puts a message on its link; `now` of `hear` is monotonic seconds."""
 
@@ -157,7 +169,7 @@ class Vehicle:
 
     def _heartbeat(self, frame: Frame, now: float) -> bool:
         message = frame.message
-        if self.component == 0:
+        if self.component == 0 and is_autopilot(frame):
             self.system, self.component = frame.system, frame.component
         if frame.component != self.component:
             return False

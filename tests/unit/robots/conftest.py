@@ -1,0 +1,62 @@
+"""A fake of the plane's session for tests of one process: puts are kept, queries go to functions."""
+
+from collections.abc import Awaitable, Callable
+
+import msgspec
+import pytest
+
+from appliance.errors import UnreachableError
+from appliance.model import RobotCommand
+from appliance.plane.keys import Keys
+
+
+class FakeSession:
+    """Keeps what is put; `answer` answers queries (None: nobody does)."""
+
+    def __init__(self) -> None:
+        self.keys = Keys("test")
+        self.puts: list[tuple[str, bytes]] = []
+        self.queries: list[bytes] = []
+        self.answer: Callable[[bytes], Awaitable[bytes]] | None = None
+
+    def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:
+        self.puts.append((key, payload))
+
+    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        self.queries.append(payload)
+        if self.answer is None:
+            raise UnreachableError(f"nobody answers {key}")
+        return await self.answer(payload)
+
+    def commanded(self) -> list[RobotCommand]:
+        """Return the commands that were announced as taken up."""
+        return [msgspec.json.decode(value, type=RobotCommand) for key, value in self.puts if key.endswith("/commanded")]
+
+
+class FakeStore:
+    """Key-value store in memory, as the plane's Store keeps them on disk."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, bytes] = {}
+
+    async def get(self, key: str) -> bytes | None:
+        return self.values.get(key)
+
+    async def put(self, key: str, value: bytes) -> None:
+        self.values[key] = value
+
+    async def delete(self, key: str) -> None:
+        self.values.pop(key, None)
+
+    async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
+        return [(key, value) for key, value in self.values.items() if key.startswith(prefix)]
+
+
+@pytest.fixture
+def session() -> FakeSession:
+    return FakeSession()
+
+
+@pytest.fixture
+def store() -> FakeStore:
+    return FakeStore()
