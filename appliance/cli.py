@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import sdnotify
 import uvloop
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from appliance import console, logs
+from appliance import console, logs, service
 from appliance.client import Endpoint, FleetClient
 from appliance.errors import ConfigError, SwiftbotError
 from appliance.model import TaskRecord, TaskRequest, TaskState
@@ -228,13 +227,15 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
     async def go() -> None:
         # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
         plane = PlaneConfig(mode="peer", connect=connect)
-        notifier = sdnotify.SystemdNotifier()
-        await run_recorder(
-            settings, plane, fleet, _until_signalled(), alive=lambda _: notifier.notify("READY=1\nWATCHDOG=1")
-        )
+        await run_recorder(settings, plane, fleet, _until_signalled(), alive=_tell_systemd)
 
     uvloop.run(go())
     return 0
+
+
+def _tell_systemd(_: object) -> None:
+    service.ready()
+    service.alive()
 
 
 def _until_signalled() -> asyncio.Event:

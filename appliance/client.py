@@ -7,7 +7,7 @@ import asyncio
 import contextlib
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -103,7 +103,7 @@ class FleetClient:
         """Stop a task."""
         return await self._ask("cancel", TaskAsk(id=task), TaskRecord)
 
-    async def watch(self, task: str, *, poll_s: float = 1.0) -> AsyncIterator[TaskRecord]:
+    async def watch(self, task: str, *, poll_s: float = 1.0) -> AsyncGenerator[TaskRecord]:
         """Yield a task's record whenever it changes, until it has ended; survives the loss of gateways.
 
         Changes are pushed; every `poll_s` the record is asked for as well, in case a push was missed.

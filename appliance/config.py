@@ -6,6 +6,7 @@ its default and the reason for it, made from these structs.
 
 import tomllib
 from pathlib import Path
+from typing import Any, cast
 
 import msgspec
 from msgspec import Struct, field
@@ -94,10 +95,11 @@ def dump(config: GatewayConfig) -> str:
     """Write a configuration as TOML with all that differs from the defaults."""
     lines: list[str] = []
     tables: list[str] = []
-    defaults = msgspec.to_builtins(GatewayConfig(id=config.id))
-    for key, value in msgspec.to_builtins(config).items():
+    defaults = cast("dict[str, Any]", msgspec.to_builtins(GatewayConfig(id=config.id)))
+    for key, value in cast("dict[str, Any]", msgspec.to_builtins(config)).items():
         if isinstance(value, dict):
-            changed = {k: v for k, v in value.items() if v != defaults[key].get(k)}
+            section = cast("dict[str, Any]", value)
+            changed = {k: v for k, v in section.items() if v != defaults[key].get(k)}
             if changed:
                 tables += ["", f"[{key}]", *(f"{k} = {_toml(v)}" for k, v in changed.items())]
         elif key == "id" or value != defaults[key]:
@@ -109,9 +111,10 @@ def _toml(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{msgspec.json.encode(str(k)).decode()} = {_toml(v)}" for k, v in value.items()) + "}"  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        table = cast("dict[str, object]", value)
+        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(each)}" for key, each in table.items()) + "}"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(each) for each in value) + "]"  # pyright: ignore[reportUnknownVariableType]
+        return "[" + ", ".join(_toml(each) for each in cast("list[object]", value)) + "]"
     if isinstance(value, str):
         return msgspec.json.encode(value).decode()
     return repr(value)

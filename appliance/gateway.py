@@ -15,10 +15,9 @@ from pathlib import Path
 
 import msgspec
 import psutil
-import sdnotify
 import structlog
 
-from appliance import logs
+from appliance import logs, service
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, SwiftbotError
 from appliance.llm.cascade import Decomposer
@@ -238,24 +237,23 @@ async def run(config: GatewayConfig) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    notifier = sdnotify.SystemdNotifier()
     gateway = Gateway(config)
     await gateway.start()
-    notifier.notify("READY=1")
-    watchdog = asyncio.create_task(_watchdog(notifier), name="watchdog")
+    service.ready()
+    watchdog = asyncio.create_task(_watchdog(), name="watchdog")
     try:
         await stop.wait()
     finally:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.remove_signal_handler(number)
-        notifier.notify("STOPPING=1")
+        service.stopping()
         watchdog.cancel()
         await gateway.stop()
 
 
-async def _watchdog(notifier: sdnotify.SystemdNotifier) -> None:
-    """Tell systemd that the event loop turns, at half the interval it asks for."""
-    interval_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
+async def _watchdog() -> None:
+    """Tell systemd that the event loop turns."""
+    interval_s = service.watchdog_s()
     while interval_s:
-        notifier.notify("WATCHDOG=1")
+        service.alive()
         await asyncio.sleep(interval_s)

@@ -11,6 +11,7 @@ import contextlib
 import time
 import uuid
 from collections.abc import Callable
+from typing import cast
 
 import msgspec
 import structlog
@@ -400,9 +401,11 @@ def _holds(record: TaskRecord, target: SubtaskRecord) -> dict[str, float]:
 def _gateways_in(value: object) -> list[str]:
     """Gateways named by artifact references anywhere in a result."""
     if isinstance(value, dict):
-        if "artifact" in value and isinstance(value.get("gateway"), str):
-            return [str(value["gateway"])]
-        return [found for each in value.values() for found in _gateways_in(each)]
+        table = cast("dict[str, object]", value)
+        gateway = table.get("gateway")
+        if "artifact" in table and isinstance(gateway, str):
+            return [gateway]
+        return [found for each in table.values() for found in _gateways_in(each)]
     if isinstance(value, list | tuple):
-        return [found for each in value for found in _gateways_in(each)]
+        return [found for each in cast("list[object]", value) for found in _gateways_in(each)]
     return []

@@ -1,0 +1,31 @@
+"""What systemd wants to hear of a daemon (sd_notify): readiness, the watchdog, that it stops.
+
+Without systemd every call does nothing, so daemons tell it unconditionally.
+"""
+
+import os
+from typing import Any
+
+import sdnotify
+
+_notifier: Any = sdnotify.SystemdNotifier()  # untyped library
+
+
+def ready() -> None:
+    """The service can work."""
+    _notifier.notify("READY=1")
+
+
+def alive() -> None:
+    """It still turns."""
+    _notifier.notify("WATCHDOG=1")
+
+
+def stopping() -> None:
+    """It is on its way out; the drain deadline is systemd's TimeoutStopSec."""
+    _notifier.notify("STOPPING=1")
+
+
+def watchdog_s() -> float:
+    """Half the interval within which systemd wants to hear `alive`, seconds; 0 without a watchdog."""
+    return int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
