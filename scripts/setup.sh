@@ -225,13 +225,20 @@ configure_storage() {
 
 # Podman before 4.4 takes its OCI runtime from here only; crun, its default, refuses cgroup v1 in hybrid mode.
 configure_engine() {
-  local file=$USER_HOME/.config/containers/containers.conf text=
+  local file=$USER_HOME/.config/containers/containers.conf engine= containers= text=
   if [ -e "$file" ]; then return; fi
-  if [ "$(stat -fc %T /sys/fs/cgroup 2>/dev/null)" != cgroup2fs ]; then text+=$'runtime = "runc"\n'; fi
-  if ! systemd_runs; then text+=$'cgroup_manager = "cgroupfs"\nevents_logger = "file"\n'; fi
+  if [ "$(stat -fc %T /sys/fs/cgroup 2>/dev/null)" != cgroup2fs ]; then
+    engine+=$'runtime = "runc"\n'
+  elif ! grep -qsw pids /sys/fs/cgroup/cgroup.controllers; then
+    # Podman would ask for its default limit of processes, and containers would not start at all.
+    containers+=$'pids_limit = 0\n'
+  fi
+  if ! systemd_runs; then engine+=$'cgroup_manager = "cgroupfs"\nevents_logger = "file"\n'; fi
+  if [ -n "$containers" ]; then text+=$'[containers]\n'$containers; fi
+  if [ -n "$engine" ]; then text+=$'[engine]\n'$engine; fi
   if [ -z "$text" ]; then return; fi
-  say "podman: ${text//$'\n'/; }in containers.conf"
-  user_file "$file" $'[engine]\n'"$text"
+  say "podman: $(printf '%s' "$engine$containers" | tr '\n' ';') in containers.conf"
+  user_file "$file" "$text"
   API_STALE=1  # a service that runs already has read the old configuration
 }
 
