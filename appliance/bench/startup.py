@@ -99,7 +99,7 @@ async def run(
 
 
 @asynccontextmanager
-async def _pool(config: PoolConfig, image: str) -> AsyncIterator[Pool]:
+async def _pool(config: PoolConfig, image: str) -> AsyncGenerator[Pool]:
     """A pool of its own fleet, with a skill that does nothing, gone afterwards."""
 
     async def nobody(need: Need) -> list[Candidate]:

@@ -108,6 +108,8 @@ class PooledContainer:
         self._on_death: Callable[[PooledContainer], None] | None = on_death
         self._control: Connection | None = None
         self._spare: Connection | None = None
+        self._active: Connection | None = None
+        self._closed = False
         self._replies: asyncio.Queue[Frame] = asyncio.Queue(maxsize=16)
         self._asking = asyncio.Lock()
         self._watcher: asyncio.Task[None] | None = None
@@ -135,7 +137,7 @@ class PooledContainer:
         next_look = time.monotonic() + 1.0
         while True:
             try:
-                self._control = await Connection.open(self.folder)
+                self._control = await self._open()
                 break
             except OSError as error:
                 now = time.monotonic()
@@ -200,26 +202,35 @@ class PooledContainer:
         connection, self._spare = self._spare, None
         try:
             if connection is None:
-                connection = await Connection.open(self.folder)
+                connection = await self._open()
+            self._active = connection
             await connection.send(order)
         except OSError as error:
             raise UnreachableError(f"the runner of {self.id} is gone") from error
+        return connection
+
+    async def _open(self) -> Connection:
+        connection = await Connection.open(self.folder)
+        if self._closed:
+            connection.close()
+            raise ConnectionAbortedError(f"container {self.id} is closed")
         return connection
 
     async def refill(self) -> None:
         """Open the spare connection unless it is there; UnreachableError when the runner is gone."""
         if self._spare is None:
             try:
-                self._spare = await Connection.open(self.folder)
+                self._spare = await self._open()
             except OSError as error:
                 raise UnreachableError(f"the runner of {self.id} is gone") from error
 
     def close(self) -> None:
-        """Hang up; a run in progress is ended by its runner."""
+        """Hang up; a run in progress is ended by its runner, and whoever listens to it sees the end of file."""
+        self._closed = True
         self._on_death = None
         if self._watcher is not None:
             self._watcher.cancel()
-        for connection in (self._control, self._spare):
+        for connection in (self._control, self._spare, self._active):
             if connection is not None:
                 connection.close()
-        self._control = self._spare = None
+        self._control = self._spare = self._active = None

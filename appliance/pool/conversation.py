@@ -91,6 +91,8 @@ class Conversation:
         self._calls: set[asyncio.Task[None]] = set()
         self._lines = 0
         self._told_progress = 0.0
+        self.broken = False
+        """Whether the runner broke its protocol, so that nothing it may still say can be trusted."""
 
     def event(self, kind: RunEventKind, **more: Any) -> RunEvent:
         """Return an event of this run."""
@@ -116,6 +118,7 @@ class Conversation:
                     return final
         except PayloadError as error:
             self._refused["runner frame"] += 1
+            self.broken = True
             return self.failed(error.code, error.message)
         finally:
             for call in self._calls:

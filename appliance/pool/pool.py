@@ -324,7 +324,7 @@ class Pool:
             limit_s = request.deadline_s + self._config.cancel_grace_s + BACKSTOP_S
             async with asyncio.timeout(limit_s) as run.patience:
                 final = await conversation.listen()
-                ended = True
+                ended = not conversation.broken
                 return final
         except TimeoutError:
             code = "cancelled" if run.cancelled else "deadline"
@@ -336,7 +336,7 @@ class Pool:
                 self._keeper.spawn(self._wind_up(container, connection, conversation), f"wind up {container.id}")
             else:
                 connection.close()
-                self._keeper.retire(container, "its run did not end")
+                self._keeper.retire(container, "its run did not end as it should")
 
     async def _wind_up(self, container: PooledContainer, connection: Connection, conversation: Conversation) -> None:
         """After a run: wait until the runner has swept up, then give the container to the next."""

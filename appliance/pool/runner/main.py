@@ -118,11 +118,14 @@ class Zygote:
         signal.signal(signal.SIGCHLD, _woken)  # a handler of its own, or nothing would be written to `waker`
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._asked_to_stop)
+        # Under its name only when somebody listens: whoever sees it can connect.
+        early = f"{self._path}.new"
         with contextlib.suppress(FileNotFoundError):
-            Path(self._path).unlink()
+            Path(early).unlink()
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        listener.bind(self._path)
+        listener.bind(early)
         listener.listen(MAX_CONNECTIONS)
+        Path(early).rename(self._path)
         self._epoll.register(wake, select.EPOLLIN)
         self._epoll.register(listener, select.EPOLLIN)
         while not (self._stopping and self._run is None):

@@ -1,0 +1,275 @@
+"""The runner's protocol, against the real zygote as a plain process."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.pool.runner.frames import MAX_FRAME, Decoder, FrameError, encode
+
+pytestmark = pytest.mark.anyio
+
+Zygote = Callable[[], Awaitable[Any]]
+
+
+async def _finish(connection: Any) -> list[dict[str, Any]]:
+    """All frames of a run to the end of file."""
+    frames = []
+    async with asyncio.timeout(15):
+        while (frame := await connection.receive()) is not None:
+            frames.append(frame)
+    return frames
+
+
+async def _run(zygote: Zygote, do: str, **more: Any) -> list[dict[str, Any]]:
+    connection = await zygote()
+    params = {"do": do, **more.pop("params", {})}
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": params, "timeout_s": 10.0} | more)
+    return await _finish(connection)
+
+
+def _gone(pid: int) -> bool:
+    with contextlib.suppress(OSError):
+        return "State:\tZ" in Path(f"/proc/{pid}/status").read_text()
+    return True
+
+
+async def _wait_for(path: Path) -> str:
+    async with asyncio.timeout(10):
+        while not path.exists() or not path.read_text():
+            await asyncio.sleep(0.005)
+    return path.read_text()
+
+
+async def _wait_gone(pid: int) -> None:
+    async with asyncio.timeout(10):
+        while not _gone(pid):
+            await asyncio.sleep(0.005)
+
+
+async def test_frames_of_a_run(zygote: Zygote) -> None:
+    """A run tells that it started, its progress, logs, output and partial result, and ends with its result."""
+    frames = await _run(zygote, "echo", inputs={"a": {"b": 1}}, robot="r2", site={"name": "yard"})
+    assert frames[0]["ev"] == "started"
+    assert isinstance(frames[0]["at"], int)
+    kinds = [frame["ev"] for frame in frames]
+    assert kinds[-1] == "result"
+    assert {"progress", "log", "partial"} < set(kinds)
+    assert {frame["text"] for frame in frames if frame["ev"] == "log"} == {"hello", "printed"}
+    result = frames[-1]["result"]
+    assert (result["inputs"], result["robot"], result["site"]) == ({"a": {"b": 1}}, "r2", "yard")
+    assert result["here"] == result["scratch"]
+    assert not Path(result["scratch"]).exists()
+
+
+async def test_runs_do_not_see_each_other(zygote: Zygote) -> None:
+    """What a handler keeps in its module is gone with its child."""
+    results = [(await _run(zygote, "echo"))[-1]["result"] for _ in range(3)]
+    assert [result["runs"] for result in results] == [1, 1, 1]
+    assert len({result["scratch"] for result in results}) == 3
+
+
+async def test_call_round_trip(zygote: Zygote) -> None:
+    """A call goes out numbered, and bytes come back as bytes."""
+    connection = await zygote()
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": {"do": "call"}})
+    answers = {
+        "command": {"x": 1, "blobs": {"p": b"abc"}},
+        "put_artifact": {"artifact": "s"},
+        "get_artifact": {"data": b"\x00\xff"},
+    }
+    numbers, data = [], b""
+    while (frame := await connection.receive())["ev"] not in ("result", "error"):
+        if frame["ev"] == "call":
+            numbers.append(frame["n"])
+            data = frame["args"].get("data", data)
+            await connection.send({"n": frame["n"] - 1, "ok": {"stale": True}})
+            await connection.send({"n": frame["n"], "ok": answers[frame["name"]]})
+    assert numbers == [1, 2, 3]
+    assert data == b"\x00\xff"
+    assert frame["result"] == {"answer": {"x": 1, "blobs": {"p": 3}}, "reference": {"artifact": "s"}, "back": True}
+
+
+@pytest.mark.parametrize(
+    ("do", "code", "text", "retryable"),
+    [
+        ("fail", "skill", "no light", True),
+        ("raise", "skill", "ValueError: bad value", False),
+        ("segv", "crashed", "killed by SIGSEGV", True),
+        ("exit", "crashed", "ended by itself with status 3", True),
+        ("sys.exit", "skill", "SystemExit: 4", False),
+        ("large", "payload", "allowed", False),
+        ("huge call", "payload", "allowed", False),
+        ("memory", "memory", "ran out of its memory", True),
+        ("list", "skill", "returned list, not a dict", False),
+        ("class", "skill", "object cannot be sent", False),
+        ("nan", "skill", "Out of range float", False),
+    ],
+)
+async def test_bad_handlers(zygote: Zygote, do: str, code: str, text: str, retryable: bool) -> None:
+    """Whatever a handler does wrong, its run ends with one error that says what, and the runner lives on."""
+    frames = await _run(zygote, do)
+    error = frames[-1]
+    assert [frame["ev"] for frame in frames].count("error") == 1
+    assert (error["ev"], error["code"], error["retryable"]) == ("error", code, retryable)
+    assert text in error["message"]
+    if do in ("raise", "memory"):
+        assert any("handler.py" in line for line in error["trace"])
+    assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
+
+
+async def test_cancel_lets_the_handler_clean_up(zygote: Zygote) -> None:
+    """A cancelled handler sees Cancelled, may still talk, and its run ends as cancelled."""
+    connection, control = await zygote(), await zygote()
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": {"do": "clean up"}})
+    assert (await connection.receive())["ev"] == "started"
+    await control.send({"op": "cancel", "run": "other"})
+    assert await control.receive() == {"ok": False}
+    await control.send({"op": "cancel", "run": "r1"})
+    assert await control.receive() == {"ok": True}
+    frames = await _finish(connection)
+    assert frames[0]["text"] == "cleaned"
+    assert (frames[-1]["code"], frames[-1]["retryable"]) == ("cancelled", False)
+
+
+async def test_cancel_of_a_stubborn_handler(zygote: Zygote, tmp_path: Path) -> None:
+    """A handler that ignores SIGTERM is killed after the grace, and its run ends as cancelled."""
+    connection, control = await zygote(), await zygote()
+    order = {"do": "stubborn", "pid": str(tmp_path / "pid")}
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": order})
+    pid = int(await _wait_for(tmp_path / "pid"))
+    await control.send({"op": "cancel", "run": "r1", "grace_s": 0.1})
+    frames = await _finish(connection)
+    assert frames[-1]["code"] == "cancelled"
+    assert _gone(pid)
+
+
+async def test_deadline(zygote: Zygote, tmp_path: Path) -> None:
+    """A run that takes too long is ended, and says so."""
+    frames = await _run(zygote, "sleep", params={"pid": str(tmp_path / "pid")}, timeout_s=0.2)
+    assert frames[-1]["code"] == "deadline"
+    assert frames[-1]["retryable"]
+
+
+async def test_hang_up_ends_the_child(zygote: Zygote, tmp_path: Path) -> None:
+    """When its gateway goes away a run is ended, even one that ignores SIGTERM, and the runner is free again."""
+    for do in ("sleep", "stubborn"):
+        file = tmp_path / do
+        connection = await zygote()
+        order = {"op": "run", "run": "r1", "skill": "probe", "params": {"do": do, "pid": str(file)}}
+        await connection.send(order)
+        pid = int(await _wait_for(file))
+        connection.close()
+        await _wait_gone(pid)
+    assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
+
+
+async def test_what_a_handler_started_ends_with_it(zygote: Zygote, tmp_path: Path) -> None:
+    """A process that a handler left behind is gone when the container is free again."""
+    frames = await _run(zygote, "grandchild", params={"pid": str(tmp_path / "pid")})
+    assert frames[-1]["ev"] == "result"
+    await _wait_gone(int((tmp_path / "pid").read_text()))
+
+
+async def test_death_within_a_frame(zygote: Zygote) -> None:
+    """A child that dies within a frame gets no other frame behind it: the connection just ends."""
+    connection = await zygote()
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": {"do": "half frame"}})
+    with pytest.raises(Exception, match="cut off"):
+        await _finish(connection)
+
+
+async def test_one_run_at_a_time(zygote: Zygote, tmp_path: Path) -> None:
+    """A second run is refused while one is in progress."""
+    first, second = await zygote(), await zygote()
+    order = {"op": "run", "run": "r1", "skill": "probe", "params": {"do": "sleep", "pid": str(tmp_path / "pid")}}
+    await first.send(order)
+    await _wait_for(tmp_path / "pid")
+    await second.send(order | {"run": "r2"})
+    assert (await _finish(second))[-1]["code"] == "refused"
+
+
+async def test_skills_that_are_not_there_or_broken(zygote: Zygote) -> None:
+    """A skill that cannot be imported fails alone and is named by ping; one that is not there is refused."""
+    control = await zygote()
+    await control.send({"op": "ping"})
+    reply = await control.receive()
+    assert set(reply["problems"]) == {"broken", "module nowhere"}
+    assert "no_such_module" in reply["problems"]["broken"]
+    assert "no_such_module" in (await _run(zygote, "", skill="broken"))[-1]["message"]
+    assert (await _run(zygote, "", skill="unheard"))[-1]["code"] == "not-found"
+
+
+@pytest.mark.parametrize(
+    "data", [b"\xff\xff\xff\xff", b"\x00\x00\x00\x03abc", b"\x00\x00\x00\x02[]", b"\x00\x00\x00\x02\xff\xff"]
+)
+async def test_garbage_is_refused(zygote: Zygote, data: bytes) -> None:
+    """An oversize or malformed frame is answered with the reason and its connection closed; the runner lives on."""
+    connection = await zygote()
+    connection._writer.write(data)
+    reply = await connection.receive()
+    assert reply["ok"] is False
+    assert reply["error"].startswith("refused: ")
+    assert await connection.receive() is None
+    assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
+
+
+async def test_bad_orders_are_refused(zygote: Zygote) -> None:
+    """An unknown operation and a run with a deadline that is no number are answered with the reason."""
+    connection = await zygote()
+    await connection.send({"op": "dance"})
+    assert "dance" in (await connection.receive())["error"]
+    await connection.send({"op": "run", "skill": "probe", "timeout_s": "soon"})
+    assert (await _finish(connection))[-1]["code"] == "payload"
+    assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
+
+
+async def test_output_is_bounded(zygote: Zygote) -> None:
+    """A handler that prints without end is not stopped, but only so much is kept."""
+    frames = await _run(zygote, "flood")
+    lines = [frame["text"] for frame in frames if frame["ev"] == "log"]
+    assert frames[-1]["ev"] == "result"
+    assert lines[0] == "line 0"
+    assert any("the rest is dropped" in line for line in lines)
+
+
+async def test_stop_ends_the_run_and_the_runner(zygote: Zygote, tmp_path: Path) -> None:
+    """Told to stop, the runner ends its run first and then itself."""
+    connection, control = await zygote(), await zygote()
+    order = {"op": "run", "run": "r1", "skill": "probe", "params": {"do": "sleep", "pid": str(tmp_path / "pid")}}
+    await connection.send(order)
+    pid = int(await _wait_for(tmp_path / "pid"))
+    await control.send({"op": "stop"})
+    assert (await _finish(connection))[-1]["code"] == "cancelled"
+    assert _gone(pid)
+    process = zygote.process  # type: ignore[attr-defined]
+    assert await asyncio.wait_for(process.wait(), 10) == 0
+
+
+def test_frames_round_trip() -> None:
+    """Bytes anywhere in a value come back as bytes, whatever pieces the frame arrives in."""
+    value = {"a": [b"\x00", {"b": b""}], "c": "ü", "d": None}
+    decoder = Decoder()
+    for byte in encode(value):
+        assert decoder.next() is None
+        decoder.feed(bytes([byte]))
+    assert decoder.next() == value
+    assert decoder.pending == 0
+
+
+def test_frames_are_bounded() -> None:
+    """A frame that would be too long is not made."""
+    with pytest.raises(FrameError, match="allowed"):
+        encode({"x": "y" * MAX_FRAME})
+
+
+def test_environment_is_clean() -> None:
+    """The runner needs nothing of the appliance: its folder imports only the standard library and itself."""
+    folder = Path(__file__).resolve().parents[3] / "appliance" / "pool" / "runner"
+    text = "".join(file.read_text() for file in folder.glob("*.py"))
+    assert "appliance." not in text.replace("the appliance.", "")
+    assert os.path.exists(folder / "main.py")
