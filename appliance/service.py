@@ -4,26 +4,30 @@ Without systemd every call does nothing, so daemons tell it unconditionally.
 """
 
 import os
+from functools import cache
 from typing import Any
 
 import sdnotify
 
-_notifier: Any = sdnotify.SystemdNotifier()  # untyped library
+
+@cache
+def _notifier() -> Any:  # untyped library; it opens a socket, which only daemons need
+    return sdnotify.SystemdNotifier()
 
 
 def ready() -> None:
     """The service can work."""
-    _notifier.notify("READY=1")
+    _notifier().notify("READY=1")
 
 
 def alive() -> None:
     """It still turns."""
-    _notifier.notify("WATCHDOG=1")
+    _notifier().notify("WATCHDOG=1")
 
 
 def stopping() -> None:
     """It is on its way out; the drain deadline is systemd's TimeoutStopSec."""
-    _notifier.notify("STOPPING=1")
+    _notifier().notify("STOPPING=1")
 
 
 def watchdog_s() -> float:

@@ -1,0 +1,53 @@
+"""The command line: help everywhere, documented exit codes, clear errors."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance import cli
+
+COMMANDS = [
+    "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "fleet",
+    "pool", "robots", "log info", "log replay", "sim mavlink", "sim zenoh", "images build", "images list", "doctor",
+    "tui", "bench startup",
+]  # fmt: skip
+
+
+def run(*arguments: str) -> int:
+    """Run a command in this process and return its exit code."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(list(arguments))
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--help` ends with 0 and shows the usage."""
+    assert run(*command.split(), "--help") == 0
+    assert "Usage: swiftbot" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["frobnicate"], 2, "frobnicate"),
+        (["submit"], 2, "text"),
+        (["up", "--robots", "cats=1", "--dir", "{tmp}"], 2, "mavlink=1,zenoh=1"),
+        (["fleet", "--dir", "{tmp}"], 4, "swiftbot up"),
+        (["fleet", "--connect", "tcp/127.0.0.1:1"], 3, "tcp/127.0.0.1:1"),
+        (["log", "info", "{tmp}/none.mcap"], 4, "none.mcap"),
+        (["log", "replay", "{tmp}/none.mcap"], 4, "none.mcap"),
+        (["gateway", "--config", "{tmp}/none.toml"], 2, "none.toml"),
+        (["sim", "mavlink", "--to", "nowhere"], 2, "nowhere"),
+        (["sim", "mavlink", "--to", "udp://127.0.0.1:1", "--site", "atlantis"], 2, "atlantis"),
+    ],
+)
+def test_mistakes_end_with_the_documented_code_and_a_reason(
+    arguments: list[str], code: int, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The message names what was wrong, without a traceback."""
+    assert run(*(each.format(tmp=tmp_path) for each in arguments)) == code
+    shown = capsys.readouterr()
+    assert told in " ".join((shown.out + shown.err).split())
+    assert "Traceback" not in shown.err

@@ -1,0 +1,77 @@
+"""Configuration files: strict, complete in the documentation, the same when written and read again."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from appliance import config
+from appliance.config import GatewayConfig
+from appliance.errors import ConfigError
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.settings import PoolConfig
+from appliance.robots.settings import MavlinkLink, RobotsConfig
+
+
+def write(path: Path, text: str) -> Path:
+    """Write a file and return its path."""
+    path.write_text(text)
+    return path
+
+
+def test_only_the_id_must_be_given(tmp_path: Path) -> None:
+    """Everything else has a default."""
+    assert config.load(write(tmp_path / "g.toml", 'id = "gw-1"\n')) == GatewayConfig(id="gw-1")
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('id = "gw-1"\nfleat = "x"', "fleat"),
+        ('id = "gw-1"\n[pool]\ncapacity = "many"', "pool.capacity"),
+        ('id = "gw-1"\n[plane]\nlissen = []', "lissen"),
+        ('id = "GW 1"', "GW 1"),
+        ('id = "gw-1"\nlog_level = "loud"', "loud"),
+        ("id = ", "not TOML"),
+        ("", "id"),
+        ('id = "gw-1"\n[[robots.mavlink]]\nlisten = "tcp://x"', "tcp://x"),
+    ],
+)
+def test_a_mistake_names_file_and_key(tmp_path: Path, text: str, named: str) -> None:
+    """An unknown key, wrong type or impossible value is an error with exit code 2, not a silent default."""
+    path = write(tmp_path / "g.toml", text)
+    with pytest.raises(ConfigError) as caught:
+        config.load(path)
+    assert named in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_an_absent_file_is_an_error_with_a_remedy(tmp_path: Path) -> None:
+    """The message says which file, and what to do."""
+    with pytest.raises(ConfigError, match=r"absent\.toml") as caught:
+        config.load(tmp_path / "absent.toml")
+    assert caught.value.remedy
+
+
+def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
+    """`dump` writes what differs from the defaults, as TOML that `load` takes."""
+    made = GatewayConfig(
+        id="gw-7",
+        fleet="yard",
+        data_dir='/tmp/with "quotes" and \\ backslash',
+        skills=("/a", "/b"),
+        plane=PlaneConfig(listen=("tcp/127.0.0.1:7447",)),
+        pool=PoolConfig(floor={"base": 3}, mode="local"),
+        robots=RobotsConfig(mavlink=(MavlinkLink(names={"1": "drone_1"}),)),
+    )
+    assert config.load(write(tmp_path / "g.toml", config.dump(made))) == made
+
+
+def test_the_documentation_lists_every_key(project_root: Path) -> None:
+    """docs/configuration.md is what the sources say; `scripts/write_configuration.py` makes it."""
+    done = subprocess.run(
+        [sys.executable, str(project_root / "scripts" / "write_configuration.py"), "--check"], check=False
+    )
+    assert done.returncode == 0, "run scripts/write_configuration.py"
