@@ -532,11 +532,32 @@ def doctor(*, config: Path | None = None, as_json: Json = False) -> int:
 
 
 @bench_app.command
-def startup(*, count: int = 100, cold: int = 5, as_json: Json = False) -> int:
-    """Subtask startup: cold containers, warm local ones, warm ones found on another gateway, in one run."""
-    from appliance.bench.startup import run as bench
+def startup(*, count: int = 100, cold: int = 5, image: str = "base", as_json: Json = False) -> int:
+    """Subtask startup: cold containers, warm local ones, warm ones found on another gateway, in one run.
 
-    result = asyncio.run(bench(count=count, cold=cold))
+    Args:
+        count: Warm runs of each kind.
+        cold: Cold runs.
+        image: Image of the containers.
+    """
+    from appliance.bench.federated import run_all
+
+    result = asyncio.run(run_all(count, cold, image=image, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0
+
+
+@bench_app.command(name="record")
+def bench_record(*, messages: int = 50_000, rounds: int = 3, as_json: Json = False) -> int:
+    """Logging: messages/s of the recorder's writer beside the bare MCAP library.
+
+    Args:
+        messages: Messages a round.
+        rounds: Rounds of each; the median counts.
+    """
+    from appliance.bench.record import run as bench
+
+    result = asyncio.run(bench(messages=messages, rounds=rounds))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0
 

@@ -76,8 +76,14 @@ class Order(Struct, frozen=True, kw_only=True):
     sim_rate: float = 1.0
     """How many times faster than real the simulated robots move."""
     pool: PoolConfig = PoolConfig()
+    pools: dict[str, PoolConfig] = {}
+    """Pools of single gateways, by name, instead of `pool`."""
     base: GatewayConfig | None = None
     """Configuration that the gateways' own are made from."""
+
+    def pool_of(self, gateway: str) -> PoolConfig:
+        """The pool of one gateway."""
+        return self.pools.get(gateway, self.pool)
 
 
 def default_directory(fleet: str) -> Path:
@@ -232,7 +238,7 @@ class _Starting:
                 listen=(endpoints[index],),
                 connect=tuple(endpoint for at, endpoint in enumerate(endpoints) if at != index),
             ),
-            pool=self._order.pool,
+            pool=self._order.pool_of(name),
             robots=RobotsConfig(mavlink=links),
             record=RecordConfig(directory=str(record_dir)),
         )
@@ -298,14 +304,15 @@ def _check_alive(state: FleetState) -> None:
 def _missing(client: FleetClient, state: FleetState, order: Order) -> list[str]:
     registry = client.plane.registry
     missing: list[str] = []
-    wanted = sum(order.pool.floor.values()) if order.pool.mode != "cold" else 0
     for name in state.gateways:
+        pool = order.pool_of(name)
+        wanted = min(sum(pool.floor.values()), pool.capacity) if pool.mode != "cold" else 0
         status = registry.gateways.get(name)
         if status is None:
             missing.append(f"waiting for {name}")
         elif status.pool_problem:
             missing.append(f"{name}: {status.pool_problem}")
-        elif status.ready < min(wanted, order.pool.capacity):
+        elif status.ready < wanted:
             missing.append(f"{name} warms containers: {status.ready} of {wanted}")
     for robot in state.robots:
         info = registry.robots.get(robot)

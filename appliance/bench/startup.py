@@ -2,15 +2,15 @@
 
 Cold is not made worse than it has to be: the same image, runner, mounts and hardening as the warm containers,
 made by the same code through the same API (`mode = "cold"`), one at a time, each removed afterwards. The figure
-in every case is `started.at - entry of Pool.run`, both CLOCK_MONOTONIC of this machine; for a run elsewhere the
-caller gives its own function (`federated`), since only it knows how gateways reach each other.
+in both cases is `started.at - entry of Pool.run`, both CLOCK_MONOTONIC of this machine; `federated` measures runs on
+another gateway.
 """
 
 import math
 import secrets
 import tempfile
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -37,8 +37,6 @@ cpu = 0.1
 memory_mb = 64
 """
 Progress = Callable[[str], None]
-Federated = Callable[[int], Awaitable[Sequence[float]]]
-"""Given a number of runs, the startup of each in milliseconds."""
 
 
 def summary(times_ms: Sequence[float]) -> dict[str, Any]:
@@ -59,7 +57,6 @@ async def run(
     *,
     image: str = "base",
     config: PoolConfig | None = None,
-    federated: Federated | None = None,
     progress: Progress = lambda _: None,
 ) -> dict[str, Any]:
     """Measure startup, cold and warm, in one run on this machine.
@@ -69,12 +66,11 @@ async def run(
         cold: cold runs; each makes a container.
         image: image of the containers.
         config: pool settings to start from.
-        federated: measures `count` runs in warm containers of another gateway.
         progress: told what is being measured.
 
     Returns:
-        For `cold`, `local` and, if measured, `federated`: count, p50, p90, p99, max in milliseconds; and
-        `cold_over_local`, the ratio of the medians.
+        For `cold` and `local`: count, p50, p90, p99, max in milliseconds; and `cold_over_local`, the ratio of the
+        medians.
 
     Raises:
         PrerequisiteError: Podman or the image is not there.
@@ -90,12 +86,18 @@ async def run(
         await _startup(pool, image, count)  # the first one pays for lazy imports on this side
         local_ms = [await _startup(pool, image, number) for number in range(count)]
     result: dict[str, Any] = {"unit": "ms", "image": image, "cold": summary(cold_ms), "local": summary(local_ms)}
-    if federated is not None:
-        progress(f"federated: {count} runs in warm containers of another gateway")
-        result["federated"] = summary(await federated(count))
     if cold_ms and local_ms:
         result["cold_over_local"] = round(result["cold"]["p50"] / result["local"]["p50"], 1)
     return result
+
+
+def write_skill(folder: Path, image: str) -> Path:
+    """Write the skill that does nothing; returns the folder of skills it is in."""
+    skill = folder / "skills" / SKILL
+    skill.mkdir(parents=True)
+    (skill / "skill.toml").write_text(_MANIFEST.format(image=image))
+    (skill / "handler.py").write_text("def run(ctx):\n    return {}\n")
+    return skill.parent
 
 
 @asynccontextmanager
@@ -110,16 +112,13 @@ async def _pool(config: PoolConfig, image: str) -> AsyncGenerator[Pool]:
         raise PoolError(f"{call.name} is not served here")
 
     with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
-        skill = Path(folder) / "skills" / SKILL
-        await anyio.Path(skill).mkdir(parents=True)
-        await anyio.Path(skill / "skill.toml").write_text(_MANIFEST.format(image=image))
-        await anyio.Path(skill / "handler.py").write_text("def run(ctx):\n    return {}\n")
+        skills = write_skill(Path(folder), image)
         pool = Pool(
             config,
             gateway="bench",
             fleet=f"bench-{secrets.token_hex(4)}",
             run_dir=Path(folder) / "run",
-            catalogue=load_catalogue([skill.parent]),
+            catalogue=load_catalogue([skills]),
             site=Site(),
             find_remote=nobody,
             on_call=nothing,
