@@ -1,0 +1,156 @@
+"""The systemd units: clean, hardened, and put where they belong by `make install`."""
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from appliance.config import load
+
+UNITS = ("swiftbot-gateway.service", "swiftbot-recorder.service")
+MOST_EXPOSURE = 2.0
+"""What `systemd-analyze security` may say; 10 is no hardening at all."""
+INSTALLED = (
+    "usr/local/lib/systemd/system/swiftbot-gateway.service",
+    "usr/local/lib/systemd/system/swiftbot-recorder.service",
+    "usr/local/lib/systemd/system-generators/swiftbot-generator",
+    "usr/local/lib/sysusers.d/swiftbot.conf",
+    "usr/local/lib/tmpfiles.d/swiftbot.conf",
+    "opt/swiftbot/docs/operations.md",
+    "opt/swiftbot/LICENSE",
+)
+
+
+def run(*command: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a command and return what it said, both outputs together."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("MAKE")}
+    return subprocess.run(
+        command,
+        cwd=cwd,
+        env=kept | environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        check=False,
+    )
+
+
+@pytest.fixture
+def analyze() -> str:
+    """Return systemd-analyze's path; setup installs it."""
+    found = shutil.which("systemd-analyze")
+    if found is None:
+        pytest.fail("systemd-analyze is not installed: run `make setup` (scripts/setup.sh dev)")
+    return found
+
+
+@pytest.fixture
+def installed(project_root: Path, tmp_path: Path) -> Path:
+    """Lay the files out as `make install` does, without the program itself."""
+    target = tmp_path / "root"
+    done = run("make", "install", cwd=project_root, DESTDIR=str(target), WITHOUT_ENVIRONMENT="1")
+    assert done.returncode == 0, done.stdout
+    return target
+
+
+@pytest.fixture
+def unit_folder(installed: Path, tmp_path: Path) -> Path:
+    """Return a folder with the units as systemd would see them: the generator's parts beside them, a program there."""
+    folder = tmp_path / "units"
+    folder.mkdir()
+    program = tmp_path / "swiftbot"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    for unit in UNITS:
+        text = (installed / "usr/local/lib/systemd/system" / unit).read_text()
+        page = installed / "opt/swiftbot/docs/operations.md"
+        text = text.replace("/opt/swiftbot/venv/bin/swiftbot", str(program))
+        (folder / unit).write_text(text.replace("/opt/swiftbot/docs/operations.md", str(page)))
+    users = tmp_path / "passwd"
+    users.write_text("root:x:0:0::/root:/bin/sh\nswiftbot:x:990:990::/var/lib/swiftbot:/usr/sbin/nologin\n")
+    generator = installed / "usr/local/lib/systemd/system-generators/swiftbot-generator"
+    done = run(str(generator), str(folder), str(folder), str(folder), cwd=folder, PASSWD=str(users))
+    assert done.returncode == 0, done.stdout
+    return folder
+
+
+def test_units_are_clean(analyze: str, unit_folder: Path) -> None:
+    """`systemd-analyze verify` has nothing to say about the units with what the generator adds to them."""
+    paths = [str(unit_folder / unit) for unit in UNITS]
+    done = run(analyze, "verify", "--man=no", *paths, cwd=unit_folder, SYSTEMD_UNIT_PATH=f"{unit_folder}:")
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_units_are_hardened(analyze: str, unit_folder: Path, unit: str) -> None:
+    """Each unit's exposure, with what the generator adds, is at most 2.0 of 10."""
+    done = run(
+        analyze,
+        "security",
+        "--offline=true",
+        "--no-pager",
+        str(unit_folder / unit),
+        cwd=unit_folder,
+        SYSTEMD_UNIT_PATH=f"{unit_folder}:",
+    )
+    found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
+    assert found is not None, done.stdout
+    assert float(found[1]) <= MOST_EXPOSURE
+
+
+def test_the_generator_binds_only_the_podman_folder(unit_folder: Path) -> None:
+    """Of the user's runtime folder the gateway sees `podman` alone, under the id that the user has."""
+    text = (unit_folder / "swiftbot-gateway.service.d/10-podman.conf").read_text()
+    assert "BindPaths=/run/user/990/podman\n" in text
+    assert "After=user@990.service\n" in text
+    assert "Delegate=cpu cpuset io memory pids\n" in (unit_folder / "user@990.service.d/10-swiftbot.conf").read_text()
+
+
+def test_the_generator_waits_for_the_user(installed: Path, tmp_path: Path) -> None:
+    """Before the user exists the generator writes nothing and does not fail: it would hold up the boot."""
+    users = tmp_path / "passwd"
+    users.write_text("root:x:0:0::/root:/bin/sh\n")
+    out = tmp_path / "out"
+    out.mkdir()
+    generator = installed / "usr/local/lib/systemd/system-generators/swiftbot-generator"
+    done = run(str(generator), str(out), str(out), str(out), cwd=out, PASSWD=str(users))
+    assert (done.returncode, list(out.iterdir())) == (0, [])
+
+
+def test_install_puts_files_and_uninstall_removes_them(installed: Path, project_root: Path) -> None:
+    """`make install` lays everything out; `make uninstall` leaves configuration and data, PURGE=1 nothing."""
+    for name in INSTALLED:
+        assert (installed / name).is_file(), name
+    assert os.access(installed / "usr/local/lib/systemd/system-generators/swiftbot-generator", os.X_OK)
+    assert (installed / "var/lib/swiftbot/.config/systemd/user/sockets.target.wants/podman.socket").is_symlink()
+
+    done = run("make", "uninstall", cwd=project_root, DESTDIR=str(installed))
+    assert done.returncode == 0, done.stdout
+    left = {str(path.relative_to(installed)) for path in installed.rglob("*") if not path.is_dir()}
+    assert left == {
+        "etc/swiftbot/gateway.toml",
+        "var/lib/swiftbot/.config/systemd/user/sockets.target.wants/podman.socket",
+    }
+    done = run("make", "uninstall", cwd=project_root, DESTDIR=str(installed), PURGE="1")
+    assert done.returncode == 0, done.stdout
+    assert [path for path in installed.rglob("*") if not path.is_dir()] == []
+
+
+def test_a_configuration_is_never_overwritten(installed: Path, project_root: Path) -> None:
+    """A second install, as in an upgrade, keeps what the operator wrote."""
+    config = installed / "etc/swiftbot/gateway.toml"
+    config.write_text('id = "mine"\n')
+    done = run("make", "install", cwd=project_root, DESTDIR=str(installed), WITHOUT_ENVIRONMENT="1")
+    assert done.returncode == 0, done.stdout
+    assert config.read_text() == 'id = "mine"\n'
+
+
+def test_the_installed_configuration_is_valid(installed: Path) -> None:
+    """What install writes is a configuration that the gateway accepts, with the folders that its unit may write."""
+    config = load(installed / "etc/swiftbot/gateway.toml")
+    assert config.id
+    assert (config.data_dir, config.run_dir) == ("/var/lib/swiftbot/data", "/run/swiftbot")
+    assert config.record.directory == "/var/lib/swiftbot/log"
