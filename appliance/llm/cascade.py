@@ -225,7 +225,7 @@ def _refusal(attempts: Sequence[TierAttempt]) -> PlanError:
 
 
 @contextlib.asynccontextmanager
-async def _deadline(seconds: float, tier: str):  # noqa: ANN202 - a context manager, typed by its decorator
+async def _deadline(seconds: float, tier: str):
     """Abandon a tier that does not answer in time."""
     try:
         async with asyncio.timeout(seconds):

@@ -11,7 +11,7 @@ import msgspec
 
 from appliance.llm.settings import PlanContext
 from appliance.model import Plan
-from appliance.skills.catalogue import Catalogue
+from appliance.skills.catalogue import Catalogue, SkillManifest
 
 MAX_NAMES = 60
 """Robots and places listed at most; more would crowd out the instruction."""
@@ -22,41 +22,49 @@ You turn an operator's instruction for a robot fleet into a plan. Answer with on
 
 Rules
 1. Use only skills of the catalogue, the most specific that fits, with their parameters only; * marks required ones.
-2. Plan only what is asked, plus the way there: before an action at a named place where the robot is not yet, add goto
-   to it. Bringing X from A to B is goto A, pick X, goto B, place X at B; for a person give X to them instead of place,
-   for a robot handover. Putting or moving a thing the robot does not hold is pick, then place. No goto for an action
-   that names only its object, for a skill with its own place or area, or for a receptacle. takeoff and land only when said.
-3. robot: its name in lower case, spaces as _. Unnamed: any; several unnamed: any1, any2. All robots: one copy for each of
-   the roster. rendezvous, form_up, lift_together list all in robots and have the first as robot. Compute skills: null.
-4. after lists direct predecessors only. Commands to one robot are in sequence; different robots are parallel unless an
-   order is said; "while", "meanwhile", "at the same time" are parallel. report and notify come after what they are about.
+2. Plan only what is asked, plus the way there: before an action at a named place where the robot is not yet, add
+   goto to it. Bringing X from A to B is goto A, pick X, goto B, place X at B; for a person give X to them instead of
+   place, for a robot handover. Putting or moving a thing the robot does not hold is pick, then place. No goto for an
+   action that names only its object, for a skill with its own place or area, or for a receptacle. takeoff and land
+   only when said.
+3. robot: its name in lower case, spaces as _. Unnamed: any; several unnamed: any1, any2. All robots: one copy for
+   each of the roster. rendezvous, form_up, lift_together list all in robots and have the first as robot. Compute
+   skills: null.
+4. after lists direct predecessors only. Commands to one robot are in sequence; different robots are parallel unless
+   an order is said; "while", "meanwhile", "at the same time" are parallel. report and notify come after what they
+   are about.
 5. "When/once X": wait_for X, or the subtask that does X, comes first. Staying for a time is hold.
 6. "Twice" is laps or count where the skill has it, else copies. "Each of goals 1 and 2": one copy each, in order.
 7. Parameters: lower case, no articles, numbers in the parameter's unit (_s seconds, _m metres, _mps m/s, _ms
    milliseconds). Leave out what is not said. text, question and event keep their words.
 """
 
-EXAMPLES: tuple[tuple[str, str], ...] = (
+_DELIVERY = """\
+{"domain":"manipulation","subtasks":[
+{"id":"s1","skill":"goto","robot":"robot_1","params":{"place":"dock 3"},"after":[]},
+{"id":"s2","skill":"pick","robot":"robot_1","params":{"object":"red box"},"after":["s1"]},
+{"id":"s3","skill":"goto","robot":"robot_1","params":{"place":"packing table"},"after":["s2"]},
+{"id":"s4","skill":"place","robot":"robot_1","params":{"object":"red box","at":"packing table"},"after":["s3"]},
+{"id":"s5","skill":"record_video","robot":"robot_2","params":{"target":"aisle","duration_s":60},"after":[]}]}"""
+_GROUP = """\
+{"domain":"inspection","subtasks":[
+{"id":"s1","skill":"inspect","robot":"drone_1","params":{"asset":"mast"},"after":[]},
+{"id":"s2","skill":"inspect","robot":"drone_2","params":{"asset":"mast"},"after":[]},
+{"id":"s3","skill":"report","robot":null,"params":{"to":"operator"},"after":["s1","s2"]}]}"""
+
+EXAMPLES: tuple[tuple[str, str, str], ...] = (
     (
-        "Robot_1: fetch the red box from dock 3 and bring it to the packing table, while Robot_2 films the aisle for a minute",
-        '{"domain":"manipulation","subtasks":['
-        '{"id":"s1","skill":"goto","robot":"robot_1","params":{"place":"dock 3"},"after":[]},'
-        '{"id":"s2","skill":"pick","robot":"robot_1","params":{"object":"red box"},"after":["s1"]},'
-        '{"id":"s3","skill":"goto","robot":"robot_1","params":{"place":"packing table"},"after":["s2"]},'
-        '{"id":"s4","skill":"place","robot":"robot_1","params":{"object":"red box","at":"packing table"},"after":["s3"]},'
-        '{"id":"s5","skill":"record_video","robot":"robot_2","params":{"target":"aisle","duration_s":60},"after":[]}]}',
+        "robot_1, robot_2",
+        "Robot_1: bring the red box from dock 3 to the packing table, while Robot_2 films the aisle for a minute",
+        _DELIVERY.replace("\n", ""),
     ),
     (
+        "drone_1, drone_2",
         "Both drones inspect the mast, then send a report to the operator",
-        '{"domain":"inspection","subtasks":['
-        '{"id":"s1","skill":"inspect","robot":"drone_1","params":{"asset":"mast"},"after":[]},'
-        '{"id":"s2","skill":"inspect","robot":"drone_2","params":{"asset":"mast"},"after":[]},'
-        '{"id":"s3","skill":"report","robot":null,"params":{"to":"operator"},"after":["s1","s2"]}]}',
+        _GROUP.replace("\n", ""),
     ),
 )
-"""Instruction and plan; what they show: parallel robots, a delivery, a group, a computation that gathers."""
-
-_EXAMPLE_ROBOTS = ("robot_1, robot_2", "drone_1, drone_2")
+"""Roster, instruction and plan; what they show: parallel robots, a delivery, a group, a computation that gathers."""
 
 
 def messages(
@@ -64,7 +72,7 @@ def messages(
 ) -> list[dict[str, str]]:
     """Return the chat that asks for a plan; with `problems`, the one that asks to mend `previous`."""
     chat = [{"role": "system", "content": _system(catalogue)}]
-    for (instruction, plan), robots in zip(EXAMPLES, _EXAMPLE_ROBOTS, strict=True):
+    for robots, instruction, plan in EXAMPLES:
         chat += [
             {"role": "user", "content": f"Robots: {robots}\nInstruction: {instruction}"},
             {"role": "assistant", "content": plan},
@@ -100,14 +108,12 @@ def _asked(context: PlanContext) -> str:
 
 
 def _system(catalogue: Catalogue) -> str:
-    return _listing(
-        tuple(
-            f"{skill.id}({', '.join(f'{name}{chr(42) if param.required else str()}' for name, param in skill.params.items())})"
-            f"{' [compute]' if skill.runs == 'compute' else ''}: {skill.summary}"
-            for skill in catalogue.skills.values()
-        ),
-        tuple(catalogue.domains),
-    )
+    return _listing(tuple(_line(skill) for skill in catalogue.skills.values()), tuple(catalogue.domains))
+
+
+def _line(skill: SkillManifest) -> str:
+    params = ", ".join(f"{name}*" if param.required else name for name, param in skill.params.items())
+    return f"{skill.id}({params}){' [compute]' if skill.runs == 'compute' else ''}: {skill.summary}"
 
 
 @lru_cache(maxsize=4)

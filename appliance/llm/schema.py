@@ -26,6 +26,7 @@ GRAMMAR_SUBTASKS = 32
 """Longest plan the grammar allows: twice the longest of the development set, and a bound on its size."""
 MAX_ANSWER_BYTES = 256 * 1024
 _NAME_LIKE = re.compile(r"\b[A-Za-z][A-Za-z0-9]*(?:[_-][A-Za-z0-9]+|[ ]\d{1,4}\b|\d{1,4}\b)")
+_DOMAIN = '"domain":'
 _ANY = 4
 """Unnamed robots: any, any1 ... any4."""
 
@@ -113,28 +114,25 @@ def catalogue_key(catalogue: Catalogue) -> tuple[Shape, ...]:
 
 @lru_cache(maxsize=16)
 def _grammar(skills: tuple[Shape, ...], domains: tuple[str, ...], names: tuple[str, ...] | None) -> str:
+    subtasks, after, params = _text(',"subtasks":['), _text(',"after":['), _text(',"params":{')
+    comma, close = _text(","), _text("]}")
     lines = [
-        f"start: {_text('{' + chr(34) + 'domain' + chr(34) + ':')} domain {_text(',' + chr(34) + 'subtasks' + chr(34) + ':[')} t1 {_text(']}')}",
+        f"start: {_text('{' + _DOMAIN)} domain {subtasks} t1 {close}",
         f"domain: {_choice(_quoted(domain) for domain in domains)}",
         f"action: {' | '.join('a_' + skill.id for skill in skills)}",
+        'after1: ""',
     ]
     for index in range(1, GRAMMAR_SUBTASKS + 1):
         head = _text(f'{{"id":"s{index}",')
-        follow = f" ({_text(',')} t{index + 1})?" if index < GRAMMAR_SUBTASKS else ""
-        lines.append(
-            f"t{index}: {head} action {_text(chr(44) + chr(34) + 'after' + chr(34) + ':[')} after{index} {_text(']}')}{follow}"
-        )
-        if index == 1:
-            lines.append('after1: ""')
-        else:
-            lines.append(f"after{index}: (d{index} ({_text(',')} d{index})*)?")
+        follow = f" ({comma} t{index + 1})?" if index < GRAMMAR_SUBTASKS else ""
+        lines.append(f"t{index}: {head} action {after} after{index} {close}{follow}")
+        if index > 1:
+            lines.append(f"after{index}: (d{index} ({comma} d{index})*)?")
             lines.append(f"d{index}: {_choice(_quoted(f's{earlier}') for earlier in range(1, index))}")
     for skill in skills:
         robot = _text("null") if skill.compute else "robot"
         head = _text(f'"skill":"{skill.id}","robot":')
-        lines.append(
-            f"a_{skill.id}: {head} {robot} {_text(',' + chr(34) + 'params' + chr(34) + ':{')} {_params(skill)} {_text('}')}"
-        )
+        lines.append(f"a_{skill.id}: {head} {robot} {params} {_params(skill)} {_text('}')}")
     lines += [
         f"robot: {_choice(_quoted(name) for name in names)}" if names else 'robot: /"[a-z][a-z0-9_-]{0,40}"/',
         f"robots: {_text('[')} robot ({_text(',')} robot)* {_text(']')}",

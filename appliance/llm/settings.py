@@ -33,7 +33,7 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     local_max_words: int = 150
     """Longer instructions go straight to the next tier: small models lose track in long ones."""
     local_max_tokens: int = 8192
-    """Bound of prompt and answer together; the catalogue alone takes some 2,500. The model's own context is a bound too."""
+    """Bound of prompt and answer together; the catalogue takes some 2,500. The model's context bounds it too."""
     local_threads: int = 0
     """Threads of the slot; 0: as the model's configuration says. Two help prefill, one is as good for decoding."""
 

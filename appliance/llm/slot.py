@@ -9,6 +9,7 @@ prefix, which is the fixed part with the catalogue, so that only the instruction
 to one grammar; the grammar changes when the roster does.
 """
 
+import importlib
 import json
 import math
 import os
@@ -66,16 +67,16 @@ class Slot:
             raise SlotError(
                 "prerequisite", f"{folder}/genai_config.json is damaged: {error!r}", "copy the model folder again"
             ) from error
-        import onnxruntime_genai as og  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
-
-        self._og: Any = og
+        # Untyped, and loading it takes 40 MB that only this process is to pay.
+        og: Any = importlib.import_module("onnxruntime_genai")
+        self._og = og
         try:
-            config: Any = og.Config(str(folder))  # pyright: ignore[reportUnknownMemberType]
+            config = og.Config(str(folder))
             if threads:
                 options = {"model": {"decoder": {"session_options": {"intra_op_num_threads": threads}}}}
                 config.overlay(json.dumps(options))
-            self._model: Any = og.Model(config)
-            self._tokenizer: Any = og.Tokenizer(self._model)
+            self._model = og.Model(config)
+            self._tokenizer = og.Tokenizer(self._model)
         except Exception as error:
             # The library raises bare RuntimeErrors for whatever is wrong with the files.
             raise SlotError(
@@ -130,24 +131,25 @@ class Slot:
 
     def _feed(self, prompt: list[int], grammar: str) -> int:
         """Compute the prompt, reusing what the last one shares with it; return how many tokens that was."""
+        generator: Any = self._generator
         common = 0
-        if self._generator is not None and self._key == grammar:
+        if generator is not None and self._key == grammar:
             shared = min(len(prompt) - 1, len(self._seen))
             while common < shared and prompt[common] == self._seen[common]:
                 common += 1
         try:
             if common:
-                self._generator.rewind_to(common)
+                generator.rewind_to(common)
             else:
                 params = self._og.GeneratorParams(self._model)
                 params.set_search_options(max_length=self._limit, do_sample=False)
                 params.set_guidance("lark_grammar", grammar, False)
-                self._generator = self._og.Generator(self._model, params)
-                self._key = grammar
-            self._generator.append_tokens(prompt[common:])
+                generator = self._og.Generator(self._model, params)
+            generator.append_tokens(prompt[common:])
         except Exception as error:
             self._generator = None
             raise SlotError("internal", f"the local model failed on the prompt: {str(error)[:300]}") from error
+        self._generator, self._key = generator, grammar
         self._seen = list(prompt)
         return common
 

@@ -9,7 +9,7 @@ none recurses.
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 from appliance.model import Box, Place, Plan, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue, Param, SkillManifest
@@ -70,7 +70,7 @@ def validate(
             continue
         if require_implemented and not manifest.implemented:
             problems.append(
-                f"{where}: skill {manifest.id} is not implemented on this fleet: add its handler, or ask for something else"
+                f"{where}: skill {manifest.id} is not implemented on this fleet: add it, or ask for something else"
             )
         problems += [f"{where}: {text}" for text in _params(subtask, manifest)]
         problems += [f"{where}: {text}" for text in _robot(subtask, manifest, roster)]
@@ -124,7 +124,7 @@ def _order(plan: Plan) -> Iterable[str]:
             yield f"{_short(subtask.id)}: comes after {len(subtask.after)} subtasks: name the direct ones only"
         for other in subtask.after[:MAX_SUBTASKS]:
             if other not in known:
-                yield f"{_short(subtask.id)}: comes after {_short(other)}, which is not in the plan: name a subtask that is"
+                yield f"{_short(subtask.id)}: comes after {_short(other)}, which is not in the plan: name one that is"
             elif other == subtask.id:
                 yield f"{_short(subtask.id)}: comes after itself: take that out"
         waiting[subtask.id] = {other for other in subtask.after[:MAX_SUBTASKS] if other in known}
@@ -179,7 +179,7 @@ def _within(value: float) -> bool:
 def _wrong_value(name: str, value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return ""
-    if value < 0 or (value == 0 and name not in ("window_ms",)):
+    if value < 0 or (value == 0 and name != "window_ms"):
         return f"{value} is not more than 0"
     if name in ("duration_s", "timeout_s") and value > MAX_SECONDS:
         return f"{value} s is longer than a day"
@@ -283,7 +283,7 @@ def _limits(subtask: Subtask, site: Site) -> Iterable[str]:
         yield f"speed {speed:g} m/s is above this site's limit of {site.speed_limit_mps:g} m/s"
 
 
-def _number(value: Any) -> bool:
+def _number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and _within(value)
 
 

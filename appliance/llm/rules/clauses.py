@@ -10,21 +10,29 @@ from typing import Any
 from msgspec import Struct, field
 
 from appliance.llm.rules import lexicon as lx
-from appliance.llm.rules import modifiers, names, phrases
+from appliance.llm.rules import modifiers, names
+from appliance.llm.rules.grammar import steps_of
 from appliance.llm.rules.graph import Mentions
-from appliance.llm.rules.phrases import Step
+from appliance.llm.rules.phrases import PICTURES, Step
 from appliance.skills.catalogue import Catalogue
 
 _LEADING = re.compile(
-    r"(?:please|kindly|also|just|now|then|again|and|but|so|first|firstly|finally|lastly|next|i(?:'d| would) like (?:you )?to|i want you to|"
-    r"(?:i )?(?:need|want) you to|(?:could|can|would|will) you(?: please| kindly)?|be sure to|make sure to|don't forget to|go ahead and|"
-    r"start by|begin by|try to|on the gateway|could somebody(?: please)?|your (?:task|job) is to|the (?:task|job) is to|you (?:should|must|need to|have to|can|may)|"
+    r"(?:please|kindly|also|just|now|then|again|and|but|so|first|firstly|finally|lastly|next|"
+    r"i(?:'d| would) like (?:you )?to|i want you to|"
+    r"(?:i )?(?:need|want) you to|(?:could|can|would|will) you(?: please| kindly)?|be sure "
+    r"to|make sure to|don't forget to|go ahead and|"
+    r"start by|begin by|try to|on the gateway|could somebody(?: please)?|your (?:task|job)"
+    r" is to|the (?:task|job) is to|you (?:should|must|need to|have to|can|may)|"
     r"(?:i'd|i would) like|i need|i want|we need|let's|subsequently)\b[,:]?\s*",
     re.IGNORECASE,
 )
 _AUXILIARY = re.compile(
-    r"(?:(?:should|must|will|shall|can|may|needs? to|has to|have to|is to|are to|is going to|are going to|is|are|to|then|also|now|each|both|all|"
-    r"please|immediately|meanwhile|simultaneously|first|finally|has|have|had|been|quickly|slowly|carefully|'s to|'ll|subsequently|go and)\s+)+",
+    (
+        r"(?:(?:should|must|will|shall|can|may|needs? to|has to|have to|is to|are to|is going "
+        r"to|are going to|is|are|to|then|also|now|each|both|all|"
+        r"please|immediately|meanwhile|simultaneously|first|finally|has|have|had|been|quickly|"
+        r"slowly|carefully|'s to|'ll|subsequently|go and)\s+)+"
+    ),
     re.IGNORECASE,
 )
 _CAUSE = re.compile(
@@ -32,15 +40,22 @@ _CAUSE = re.compile(
     re.IGNORECASE | re.DOTALL,
 )
 _PASSIVE = re.compile(
-    r"(?P<what>.+?) (?:(?:has|have|is|are|was|were|must|should|needs?|will|shall)(?: (?:to|all|both|only))?)(?: been| be| being)*(?: (?:been|be|being))? (?P<verb>\w+)(?P<rest>\b.*)",
+    (
+        r"(?P<what>.+?) (?:(?:has|have|is|are|was|were|must|should|needs?|will|shall)(?: (?:to|"
+        r"all|both|only))?)(?: been| be| being)*(?: (?:been|be|being))? (?P<verb>\w+)(?P<rest>\b.*)"
+    ),
     re.IGNORECASE | re.DOTALL,
 )
 _SUSPICIOUS = re.compile(
-    r"\b(?:then|while|whilst|before|until|unless|because|if|meanwhile|afterwards|once|simultaneously|otherwise|except|without|not|never|don't)\b",
+    (
+        r"\b(?:then|while|whilst|before|until|unless|because|if|meanwhile|afterwards|once|simultaneously|"
+        r"otherwise|except|without|not|never|don't)\b"
+    ),
     re.IGNORECASE,
 )
 _FREE_TEXT = ("text", "question", "event")
-_PLACES = ("place",)
+_TOOLED = frozenset({"localize", "match_scene", "split_area", "fasten"})
+"""Skills in which "with X" is not the robot that does it."""
 
 
 class Who(Struct):
@@ -72,6 +87,9 @@ class Reader:
         self._known_place = known_place
         self._quotes = quotes
         self._group: list[str] = []
+        self._trying = False
+        """Whether a reading is only tried: what "there" is may be said before it is read in earnest."""
+        self._with = re.compile(rf"\s+(?:with|using|by)\s+(?P<n>{who.sure.pattern})$")
 
     # --- Scope ---------------------------------------------------------------------------------------------------
 
@@ -92,7 +110,7 @@ class Reader:
         """Resolve a place; "there" is the last one."""
         low = lx.noun(text)
         if low in ("", "it") or text.strip().lower() in ("there", "it", "that place", "same place"):
-            return self.mentions.place or self.mentions.thing
+            return self.mentions.place or self.mentions.thing or ("there" if self._trying else "")
         return low
 
     def person(self, text: str) -> str:
@@ -117,9 +135,14 @@ class Reader:
             return True
         last = low.split()[-1] if low else ""
         if re.fullmatch(
-            r"(?:operator|nurse|doctor|patient|driver|guests?|visitors?|worker|workers|technician|engineer|manager|foreman|supervisor|chef|customers?|"
-            r"guard|clerk|surgeon|surveyors?|delegates|passengers|attendant|mechanic|electrician|farmer|teacher|students?|man|woman|person|people|"
-            r"lady|gentleman|child|crew|team|staff|colleague|porter|pharmacist|receptionist|owner|inspector|officer|lead|warden|caretaker)",
+            (
+                r"(?:operator|nurse|doctor|patient|driver|guests?|visitors?|worker|workers|technician|"
+                r"engineer|manager|foreman|supervisor|chef|customers?|"
+                r"guard|clerk|surgeon|surveyors?|delegates|passengers|attendant|mechanic|electrician|farmer|"
+                r"teacher|students?|man|woman|person|people|"
+                r"lady|gentleman|child|crew|team|staff|colleague|porter|pharmacist|receptionist|owner|"
+                r"inspector|officer|lead|warden|caretaker)"
+            ),
             last,
         ):
             return True
@@ -163,6 +186,16 @@ class Reader:
         for _ in range(3):
             if (match := _LEADING.match(core)) and match.end():
                 core = core[match.end() :]
+        if match := self._with.search(core):
+            found = self.read(core[: match.start()], speaking_to=[self.names.resolve(match["n"])])
+            if (
+                found is not None
+                and found.who.kind == "elided"
+                and not any(step.skill in _TOOLED for step in found.steps)
+            ):
+                found.who = Who([self.names.resolve(match["n"])], "named")
+                found.words = words
+                return found
         for who, rest in self._subjects(core):
             self._group = who.robots or speaking_to
             if found := self._predicate(rest, explicit=who.kind != "elided"):
@@ -172,22 +205,26 @@ class Reader:
 
     def starts(self, text: str) -> bool:
         """Whether a text begins like a clause: verb first, or subject and verb."""
-        return self.read(text, speaking_to=["any"]) is not None
+        self._trying = True
+        try:
+            return self.read(text, speaking_to=["any1", "any2"]) is not None
+        finally:
+            self._trying = False
 
     def _subjects(self, text: str) -> list[tuple[Who, str]]:
         found: list[tuple[Who, str]] = []
         if cause := _CAUSE.match(text):
             target, verb = cause["rest"], cause["verb"].lower()
-            for who, rest in self._named(target):
-                rest = re.sub(r"^\s*(?:to|and)\s+(?=\w)", "" if verb != "send" else "to ", rest)
+            for who, said in self._named(target):
+                rest = re.sub(r"^\s*(?:to|and)\s+(?=\w)", "" if verb != "send" else "to ", said)
                 if verb in ("send", "dispatch"):
                     rest = re.sub(
                         r"^\s*to (?=(\w+))",
-                        lambda m: "" if m[1].lower() in lx.LEMMA and m[1].lower() not in ("dock",) else "go to ",
+                        lambda m: "" if m[1].lower() in lx.LEMMA and m[1].lower() != "dock" else "go to ",
                         rest.strip(),
                     )
                 found.append((who, rest))
-        first = text.split()[0].lower() if text.split() else ""
+        first = text.split(maxsplit=1)[0].lower() if text.split() else ""
         elided = (Who(), text)
         verb_first = first in lx.LEMMA
         subjects = self._named(text)
@@ -197,10 +234,9 @@ class Reader:
         found: list[tuple[Who, str]] = []
         if named := self.names.leading(text):
             found.append((Who(named[0], "named"), named[1]))
-            for index in range(len(named[0]) - 1, 0, -1):
-                # "Heron, Heron" or a capitalised noun after the name: a shorter list may be the subject.
-                if named[0][index] == named[0][index - 1]:
-                    found.append((Who(named[0][:1], "named"), named[1]))
+            if len(set(named[0])) < len(named[0]):
+                # "Heron, Heron, this is base": called twice, still one.
+                found.append((Who(list(dict.fromkeys(named[0])), "named"), named[1]))
         for pattern, kind in (
             (names.SEVERAL, "several"),
             (names.ALL, "all"),
@@ -240,11 +276,12 @@ class Reader:
         if lemma is None:
             return self._nominal(text) if not explicit or re.search(r"\b(?:of|scan)\b", text) else None
         tail = parts[1] if len(parts) > 1 else ""
-        lifted = (
-            re.match(r"off\b", tail, re.IGNORECASE) is not None
-            and lemma in ("take", "lift")
-            or lemma in ("launch", "climb")
+        lifted = (re.match(r"off\b", tail, re.IGNORECASE) is not None and lemma in ("take", "lift")) or lemma in (
+            "launch",
+            "climb",
         )
+        if lemma in ("wait", "hold", "hover", "stay", "pause", "remain"):
+            tail = re.sub(rf"^(?=(?:about |another )?{lx.NUMBER} ?{lx.TIME_UNIT})", "for ", tail, flags=re.IGNORECASE)
         rest, quantities = modifiers.take(tail, altitude=lifted)
         return self._match(lemma, rest, quantities)
 
@@ -252,26 +289,31 @@ class Reader:
         """Read "three photos of the stage", "thermal scan of X", "frames at 12 fps"."""
         rest, quantities = modifiers.take(text, altitude=False)
         low = rest.lower()
-        if re.match(rf"(?:{lx.NUMBER} )?(?:\w+ )?{phrases._PIC} of ", low):  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
+        if re.match(rf"(?:{lx.NUMBER} )?(?:\w+ )?{PICTURES} of ", low):
             return self._match("take", rest, quantities)
         if match := re.match(r"(?:an? )?thermal scans?(?: of|,|:)? (?P<t>.+)", rest, re.IGNORECASE):
             return self._match("take", f"thermal scan of {match['t']}", quantities)
+        if re.match(r"(?:the )?(?:audio pre-?processing|transcription|frame extraction)$", low):
+            return self._match("run", rest, quantities)
         return None
 
     def _match(
         self, lemma: str, rest: str, quantities: modifiers.Modifiers
     ) -> tuple[list[Step], str, float, dict[str, Any]] | None:
         rest = re.sub(
-            r"\s+(?:please|now|immediately|right away|straight away|too|as well|again|once|at the same time|simultaneously|in parallel|in that order|meanwhile)$",
+            (
+                r"\s+(?:please|now|immediately|right away|straight away|too|as well|again|once|at the "
+                r"same time|simultaneously|in parallel|in that order|meanwhile)$"
+            ),
             "",
             rest.strip(" ,"),
             flags=re.IGNORECASE,
         )
-        found = phrases.steps_of(lemma, rest, self)
+        found = steps_of(lemma, rest, self)
         if found is None and lemma in ("do", "make", "run", "fly", "drive", "walk") and "laps" in quantities.values:
-            found = phrases.steps_of("patrol", re.sub(r"^(?:of|around|round) ", "", rest), self)
-        if found is None and lemma == "wait" and "duration_s" in quantities.values:
-            found = phrases.steps_of("hold", rest, self)
+            found = steps_of("patrol", re.sub(r"^(?:of|around|round) ", "", rest), self)
+        if found is None and lemma in ("wait", "pause") and "duration_s" in quantities.values:
+            found = steps_of("hold", rest, self)
         if found is None:
             return None
         steps, prefix = found
@@ -309,7 +351,11 @@ class Reader:
                 if not isinstance(value, str) or key in _FREE_TEXT:
                     continue
                 count = len(value.split())
+                if key not in ("to", "target") and self.names.sure.search(value) and self.names.roster:
+                    lost += count
                 lost += max(0, count - 6)
+                if lx.LEMMA.get(value) == value and key in ("object", "target", "asset"):
+                    lost += 2  # "inspect, photograph and film the shelf": a verb is no thing
                 if _SUSPICIOUS.search(value):
                     lost += count
                 lost += 3 * bool(re.search(r"\b(?:and|to)\b", value)) * bool(count > 3)

@@ -22,7 +22,7 @@ def domain_of(subtasks: Sequence[Subtask], catalogue: Catalogue) -> str:
     if "give" in main or "handover" in main:
         main = [skill for skill in main if skill != "pick"]
     if not main:
-        main = [skill for skill in known if skill not in ("notify",)] or known
+        main = [skill for skill in known if skill != "notify"] or known
     domains = Counter(catalogue.skills[skill].domain for skill in main)
     for strong in _STRONG:
         if domains.get(strong):

@@ -30,7 +30,7 @@ class Graph:
     """Subtasks so far and what they come after."""
 
     def __init__(self, catalogue: Catalogue) -> None:
-        self._catalogue = catalogue
+        self.catalogue = catalogue
         self.steps: list[tuple[str, str | None, dict[str, Any]]] = []
         self.before: list[set[int]] = []
         self._clause: list[int] = []
@@ -61,10 +61,10 @@ class Graph:
     def new_sentence(self, *, parallel: bool) -> Snapshot | None:
         """Begin a sentence; a parallel one starts from where the one before it started."""
         start = self.sentence
-        self.sentence = self.snapshot()
         self.scope = set()
         self.thread = frozenset()
         self.barrier = frozenset()
+        self.sentence = self.snapshot()
         if parallel:
             self.barrier = start.barrier
             return start
@@ -95,7 +95,7 @@ class Graph:
         chains: dict[str, frozenset[int]] = {}
         shared: frozenset[int] = frozenset()
         for position, step in enumerate(steps):
-            manifest = self._catalogue.skills.get(step.skill)
+            manifest = self.catalogue.skills.get(step.skill)
             compute = manifest is not None and manifest.runs == "compute"
             doers: list[str | None] = [None] if compute else list(robots)
             if step.skill in ("rendezvous", "form_up", "lift_together"):
@@ -144,8 +144,12 @@ class Graph:
     def subtasks(self) -> tuple[Subtask, ...]:
         """Return the plan's subtasks with direct dependencies only, in an order in which they can run."""
         reach = [self._ancestors(node) for node in range(len(self.steps))]
-        order = sorted(range(len(self.steps)), key=lambda node: (len(reach[node]), node))
-        order.sort(key=lambda node: node)
+        order: list[int] = []
+        waiting = list(range(len(self.steps)))
+        while waiting:
+            ready = next(node for node in waiting if not reach[node] - set(order))
+            order.append(ready)
+            waiting.remove(ready)
         name = {node: f"s{index + 1}" for index, node in enumerate(order)}
         result: list[Subtask] = []
         for node in order:
@@ -226,11 +230,11 @@ class Graph:
 
     def _producers(self, skill: str) -> set[int]:
         """Return the subtasks of the latest clause that makes what a computation consumes."""
-        wanted = set(self._catalogue.skills[skill].consumes) if skill in self._catalogue.skills else set[str]()
+        wanted = set(self.catalogue.skills[skill].consumes) if skill in self.catalogue.skills else set[str]()
         makers = [
             node
             for node, (made, _, _) in enumerate(self.steps)
-            if made in self._catalogue.skills and wanted & set(self._catalogue.skills[made].produces)
+            if made in self.catalogue.skills and wanted & set(self.catalogue.skills[made].produces)
         ]
         latest = max((self._clause[node] for node in makers), default=0)
         return {node for node in makers if self._clause[node] == latest}

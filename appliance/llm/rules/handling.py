@@ -8,27 +8,12 @@ import re
 from typing import Any
 
 from appliance.llm.rules import lexicon as lx
-from appliance.llm.rules.phrases import Match, Scope, Step, on
+from appliance.llm.rules.phrases import Match, Patterns, Scope, Step
+
+PATTERNS = Patterns()
 
 _FROM = r"(?:from|out of|off)"
 _IN = r"(?:in|into|on|onto|at|inside|on top of|beside|next to|under|by|to)"
-
-
-def things(text: str) -> list[str]:
-    """Split "the red box and the blue box" into its things; "salt and pepper" stays one."""
-    parts = [part for part in re.split(r"\s*,\s*(?:and\s+)?|\s+and\s+", text) if part]
-    if len(parts) < 2:
-        return [text]
-    first = re.match(r"(?:the |a |an )?([\w-]+)s?\b", parts[0], re.IGNORECASE)
-    numbered = re.fullmatch(r"(?:the )?(.+?)s? (\d+|[A-Za-z])", parts[0].strip(), re.IGNORECASE)
-    if numbered and all(re.fullmatch(r"\d+|[A-Za-z]", part.strip()) for part in parts[1:]):
-        head = lx.singular(numbered[1])
-        return [f"{head} {numbered[2]}", *(f"{head} {part.strip()}" for part in parts[1:])]
-    if first and all(re.match(r"(?:the|a|an|his|her|its|your) ", part, re.IGNORECASE) for part in parts):
-        return parts
-    heads = {part.split()[0].lower() for part in parts if len(part.split()) > 1}
-    numbers = all(re.search(r" (?:\d+|[A-Za-z])$", part) for part in parts)
-    return parts if len(heads) == 1 and numbers else [text]
 
 
 def _at(text: str | None, scope: Scope) -> str:
@@ -38,14 +23,14 @@ def _at(text: str | None, scope: Scope) -> str:
 def _pick(match: Match, scope: Scope) -> list[Step]:
     groups = match.groupdict()
     where = _at(groups.get("from"), scope)
-    return [Step("pick", {"object": scope.thing(each)}, at=where) for each in things(match["o"])]
+    return [Step("pick", {"object": scope.thing(each)}, at=where) for each in lx.things(match["o"])]
 
 
 def _deliver(objects: str, source: str | None, to: str, scope: Scope, *, held: bool = False) -> list[Step] | None:
     """Return pick at the source, then the way to `to` and place, give or hand over."""
     inside = re.fullmatch(r"(?P<p>.+?) (?:in|at) (?P<where>.+)", to, re.IGNORECASE)
     steps: list[Step] = []
-    for each in things(objects):
+    for each in lx.things(objects):
         thing = scope.thing(each)
         if not held:
             steps.append(Step("pick", {"object": thing}, at=_at(source, scope), fetch=lx.noun(each) in ("it", "them")))
@@ -65,23 +50,26 @@ def _deliver(objects: str, source: str | None, to: str, scope: Scope, *, held: b
 
 _CARRY = "bring take carry deliver transport haul transfer move fetch get return"
 _MOVE = "bring carry deliver transport haul transfer move get fetch"
-on(
+PATTERNS.on(
     _CARRY,
     rf" (?P<o>.+?) {_FROM} (?P<a>.+?)(?:,? and (?:bring|take|carry|deliver) (?:it|them))? (?:over |back )?to (?P<b>.+)",
 )(lambda m, s: _deliver(m["o"], m["a"], m["b"], s))
-on(_CARRY, rf" (?P<o>.+?) (?:over |back )?to (?P<b>.+?) {_FROM} (?P<a>.+)")(
+PATTERNS.on(_CARRY, rf" (?P<o>.+?) (?:over |back )?to (?P<b>.+?) {_FROM} (?P<a>.+)")(
     lambda m, s: _deliver(m["o"], m["a"], m["b"], s)
 )
-on("fetch retrieve collect grab", rf"(?: up)? (?P<o>.+?)(?: (?:{_FROM}|at|in|on) (?P<from>.+))?")(_pick)
-on("get take", rf" (?P<o>.+?) {_FROM} (?P<from>.+)")(_pick)
-on("pick", rf"(?: up)? (?P<o>.+?)(?: up)?(?: (?:{_FROM}|at|in|on) (?P<from>.+))?")(_pick)
-on("grasp lift get", rf"(?: up| hold of)? (?P<o>.+?)(?: (?:{_FROM}|at|on) (?P<from>.+))?")(_pick)
-on(_CARRY, r" (?P<o>.+?) (?:over |back )?to (?P<b>.+)")(lambda m, s: _deliver(m["o"], None, m["b"], s))
+PATTERNS.on("fetch retrieve collect grab", rf"(?: up)? (?P<o>.+?)(?: (?:{_FROM}|at|in|on) (?P<from>.+))?")(_pick)
+PATTERNS.on("get take", rf" (?P<o>.+?) {_FROM} (?P<from>.+)")(_pick)
+PATTERNS.on("pick", rf"(?: up)? (?P<o>.+?)(?: up)?(?: (?:{_FROM}|at|in|on) (?P<from>.+))?")(_pick)
+PATTERNS.on("grasp lift get", rf"(?: up| hold of)? (?P<o>.+?)(?: (?:{_FROM}|at|on) (?P<from>.+))?")(_pick)
+PATTERNS.on(_CARRY, r" (?P<o>.+?) (?:over |back )?to (?P<b>.+)")(lambda m, s: _deliver(m["o"], None, m["b"], s))
 
 
-@on(
+@PATTERNS.on(
     "bring fetch get",
-    r" (?P<p>[A-Z][\w.]*(?: [A-Z][\w.]*)?|me|us|him|her|them|the \w+) (?P<o>(?:an?|the|some|his|her|two|three) .+?)(?: (?:from|out of) (?P<a>.+))?",
+    (
+        r" (?P<p>[A-Z][\w.]*(?: [A-Z][\w.]*)?|me|us|him|her|them|the \w+) (?P<o>(?:an?|the|some|"
+        r"his|her|two|three) .+?)(?: (?:from|out of) (?P<a>.+))?"
+    ),
 )
 def _bring_person(match: Match, scope: Scope) -> list[Step] | None:
     return _deliver(match["o"], match["a"], match["p"], scope)
@@ -91,7 +79,7 @@ def _put(match: Match, scope: Scope) -> list[Step]:
     prep = match["prep"].lower()
     target = match["b"]
     steps: list[Step] = []
-    for each in things(match["o"]):
+    for each in lx.things(match["o"]):
         step = Step("place", {"object": scope.thing(each), "at": scope.place(target)}, fetch=True)
         if prep == "at" or scope.known_place(target):
             step.at = step.params["at"]
@@ -99,10 +87,10 @@ def _put(match: Match, scope: Scope) -> list[Step]:
     return steps
 
 
-on("put place set lay drop load store stow stack leave", rf"(?: down)? (?P<o>.+?)(?: down)? (?P<prep>{_IN}) (?P<b>.+)")(
-    _put
-)
-on("put set drop place", rf" (?P<o>it|them) down (?P<prep>{_IN}) (?P<b>.+)")(_put)
+PATTERNS.on(
+    "put place set lay drop load store stow stack leave", rf"(?: down)? (?P<o>.+?)(?: down)? (?P<prep>{_IN}) (?P<b>.+)"
+)(_put)
+PATTERNS.on("put set drop place", rf" (?P<o>it|them) down (?P<prep>{_IN}) (?P<b>.+)")(_put)
 
 
 def _hand(match: Match, scope: Scope) -> list[Step] | None:
@@ -113,8 +101,8 @@ def _hand(match: Match, scope: Scope) -> list[Step] | None:
     return [Step("give", {"object": scope.thing(match["o"]), "to": scope.person(to)})]
 
 
-on("hand pass give", r"(?: over)? (?P<o>.+?)(?: over)? to (?P<to>.+)")(_hand)
-on(
+PATTERNS.on("hand pass give", r"(?: over)? (?P<o>.+?)(?: over)? to (?P<to>.+)")(_hand)
+PATTERNS.on(
     "give hand pass",
     r" (?P<to>[A-Z][\w.]*(?: [A-Z][\w.]*)?|me|us|him|her|it|the \w+) (?P<o>(?:an?|the|some|his|her|it) ?.*)",
 )(_hand)
@@ -125,14 +113,14 @@ def _simple(lemmas: str, tail: str, skill: str) -> None:
         groups = match.groupdict()
         at = _at(groups.get("loc"), scope)
         steps: list[Step] = []
-        for each in things(match["o"]):
+        for each in lx.things(match["o"]):
             params: dict[str, Any] = {"object": scope.thing(each)}
             if groups.get("to"):
                 params["into" if skill == "pour" else "to"] = scope.thing(groups["to"])
             steps.append(Step(skill, params, at=at))
         return steps
 
-    on(lemmas, tail)(maker)
+    PATTERNS.on(lemmas, tail)(maker)
 
 
 _LOC = r"(?: (?:at|in|inside) (?P<loc>.+?))?"
@@ -155,12 +143,17 @@ _simple(
 _simple("unfasten unscrew unbolt loosen detach", rf" (?P<o>.+?){_LOC}", "unfasten")
 
 # Going comes last: "move" and "take" mean it only when nothing is moved or taken.
-on(
+PATTERNS.on(
     "go drive walk fly head proceed travel navigate move roll advance run set continue make come get return",
-    r" (?:(?:straight|directly|over|up|down|back|on|out|off|along|quickly|slowly|your way|its way|their way) )*(?:to|towards?|into|for) (?P<p>.+)",
-)(lambda m, s: [Step("goto", {"place": s.place(each)}) for each in things(m["p"])])
-on("go drive walk fly", r" (?:down|up|along|through) (?P<p>.+)")(
+    (
+        r" (?:(?:straight|directly|over|up|down|back|on|out|off|along|quickly|slowly|your way|"
+        r"its way|their way) )*(?:to|towards?|into|for) (?P<p>.+)"
+    ),
+)(lambda m, s: [Step("goto", {"place": s.place(each)}) for each in lx.things(m["p"])])
+PATTERNS.on("go drive walk fly", r" (?:down|up|along|through) (?P<p>.+)")(
     lambda m, s: [Step("goto", {"place": s.place(m["p"])})]
 )
-on("go drive fly walk head", r" there")(lambda m, s: [Step("goto", {"place": s.place("there")})])
-on("visit reach", r" (?P<p>.+)")(lambda m, s: [Step("goto", {"place": s.place(each)}) for each in things(m["p"])])
+PATTERNS.on("go drive fly walk head", r" there")(lambda _, s: [Step("goto", {"place": s.place("there")})])
+PATTERNS.on("visit reach", r" (?P<p>.+)")(
+    lambda m, s: [Step("goto", {"place": s.place(each)}) for each in lx.things(m["p"])]
+)

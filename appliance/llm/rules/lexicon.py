@@ -57,29 +57,55 @@ _IRREGULAR = {
     "write": "writes writing written wrote",
 }
 _REGULAR = (
-    "drive walk head proceed travel navigate move roll advance visit reach return follow traverse patrol explore survey "
-    "localise localize compute work calculate hover stay remain wait orbit circle land launch lift climb dock attach pick "
+    "drive walk head proceed travel navigate move roll advance visit reach return follow "
+    "traverse patrol explore survey "
+    "localise localize compute work calculate hover stay remain wait orbit circle land launch "
+    "lift climb dock attach pick "
     "grasp collect fetch retrieve carry deliver transport haul place load store stow stack push pull shove open close "
     "slice trim clean wash wipe vacuum dust rinse pour decant tip switch turn power fasten screw bolt tighten mount "
     "unfasten unscrew unbolt loosen detach photograph picture video videotape record locate look search detect count "
     "track match register measure gather assemble rendezvous converge form line hand pass divide merge combine inspect "
-    "examine check compare report notify inform alert message announce ask guide escort accompany extract sample encode "
-    "classify preprocess denoise transcribe correct train aggregate evaluate test build create file image hear continue "
+    "examine check compare report notify inform alert message announce ask guide escort accompany "
+    "extract sample encode "
+    "classify preprocess denoise transcribe correct train aggregate evaluate test build create "
+    "file image hear continue pause "
     "touch join sound rotate identify monitor repeat estimate conduct perform"
 )
 FILLER = re.compile(
-    r"\b(?:please|kindly|now|just|also|again|then|first|firstly|finally|lastly|next|immediately|straight away|right away|"
+    r"\b(?:please|kindly|now|just|also|again|then|first|firstly|finally|lastly|next|immediately|"
+    r"straight away|right away|"
     r"at once|over to you|ok|okay|right|so|well|thanks|thank you|out|both|each|all)\b",
     re.IGNORECASE,
 )
-_NUMBERS = {
-    word: value
+_NUMBERS: dict[str, float] = {
+    word: float(value)
     for value, word in enumerate(
-        "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen "
-        "eighteen nineteen twenty".split()
+        [
+            "zero",
+            "one",
+            "two",
+            "three",
+            "four",
+            "five",
+            "six",
+            "seven",
+            "eight",
+            "nine",
+            "ten",
+            "eleven",
+            "twelve",
+            "thirteen",
+            "fourteen",
+            "fifteen",
+            "sixteen",
+            "seventeen",
+            "eighteen",
+            "nineteen",
+            "twenty",
+        ]
     )
 } | {"thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "ninety": 90, "hundred": 100, "a": 1, "an": 1, "once": 1}
-_NUMBERS |= {"twice": 2, "thrice": 3, "both": 2, "half": 0.5}
+_NUMBERS.update({"twice": 2, "thrice": 3, "both": 2, "half": 0.5})
 WORD_NUMBER = "|".join(sorted(_NUMBERS, key=len, reverse=True))
 NUMBER = (
     r"(?:\d{1,7}(?:\.\d{1,4})?|half an?|(?:an? |three )?quarters? of an?|half|twenty[ -]five|forty[ -]five|"
@@ -97,7 +123,7 @@ def _third(verb: str) -> str:
 
 
 def _forms(verb: str) -> tuple[str, ...]:
-    stem = verb[:-1] if verb.endswith("e") else verb
+    stem = verb.removesuffix("e")
     past = verb[:-1] + "ied" if verb.endswith("y") and verb[-2] not in "aeiou" else stem + "ed"
     return (_third(verb), stem + "ing", past)
 
@@ -133,7 +159,7 @@ _CONNECTIVES = (
 )
 _SPELLINGS = {
     **{word: word for word in _CONNECTIVES},
-    **{word: word for word in LEMMA if len(word) >= 5},
+    **{word: word for word, base in LEMMA.items() if len(word) >= 5 and word in (base, _third(base))},
 }
 
 
@@ -150,7 +176,11 @@ def spell(word: str) -> str:
     if len(low) >= 5:
         for i in range(len(low)):
             shorter = low[:i] + low[i + 1 :]
-            if (i and low[i] == low[i - 1] or len(low) >= 8) and shorter in _SPELLINGS and not low.endswith("s"):
+            if (
+                ((i and low[i] == low[i - 1]) or (len(low) >= 7 and i < len(low) - 1))
+                and shorter in _SPELLINGS
+                and not low.endswith("s")
+            ):
                 return shorter
     if low in ("plese", "pleas", "plase"):
         return "please"
@@ -217,7 +247,7 @@ def noun(text: str) -> str:
     """Return a noun phrase as a parameter holds it: lower case, no articles, quotes or trailing fillers."""
     text = re.sub(r"[\"\u201c\u201d]", "", text).strip(" ,.;:!?-\n\t")
     text = re.sub(
-        r"(?:,? (?:please|now|again|too|as well|there|here|first|immediately|afterwards|together|please))+$",
+        r"(?:,? (?:please|now|again|too|as well|there|here|each|first|immediately|afterwards|together|please))+$",
         "",
         text,
         flags=re.IGNORECASE,
@@ -236,3 +266,20 @@ def singular(word: str) -> str:
     if word.endswith(("ches", "shes", "xes", "sses")):
         return word[:-2]
     return word[:-1] if word.endswith("s") and not word.endswith("ss") else word
+
+
+def things(text: str) -> list[str]:
+    """Split "the red box and the blue box" into its things; "salt and pepper" stays one."""
+    parts = [part for part in re.split(r"\s*,\s*(?:and\s+)?|\s+and\s+", text) if part]
+    if len(parts) < 2:
+        return [text]
+    first = re.match(r"(?:the |a |an )?([\w-]+)s?\b", parts[0], re.IGNORECASE)
+    numbered = re.fullmatch(r"(?:the )?(.+?)s? (\d+|[A-Za-z])", parts[0].strip(), re.IGNORECASE)
+    if numbered and all(re.fullmatch(r"\d+|[A-Za-z]", part.strip()) for part in parts[1:]):
+        head = singular(numbered[1])
+        return [f"{head} {numbered[2]}", *(f"{head} {part.strip()}" for part in parts[1:])]
+    if first and all(re.match(r"(?:the|a|an|his|her|its|your) ", part, re.IGNORECASE) for part in parts):
+        return parts
+    heads = {part.split()[0].lower() for part in parts if len(part.split()) > 1}
+    numbers = all(re.search(r" (?:\d+|[A-Za-z])$", part) for part in parts)
+    return parts if len(heads) == 1 and numbers else [text]

@@ -31,7 +31,8 @@ def _rule(pattern: str) -> re.Pattern[str]:
 
 _WINDOW = (
     _rule(
-        rf",?\s*\b(?:with|using|over|in)?\s*\b(?:an? |the )?(?:time )?window (?:length )?(?:of )?(?P<n>{_N}) ?(?P<u>ms|milliseconds?|seconds?|s)\b"
+        rf",?\s*\b(?:with|using|over|in)?\s*\b(?:an? |the )?(?:time )?window (?:length )?(?:of "
+        rf")?(?P<n>{_N}) ?(?P<u>ms|milliseconds?|seconds?|s)\b"
     ),
     _rule(rf"\b(?:with|using|over|in) an? (?P<n>{_N})[ -]?(?P<u>ms|millisecond|second|s)\b window"),
 )
@@ -41,7 +42,7 @@ _TIMEOUT = (
 )
 _DURATION = (
     _rule(rf",?\s*\bfor (?:about |around |exactly |another |the next )?(?P<n>{_N})[ -]?(?P<u>{_T})"),
-    _rule(rf"\b(?P<n>\d+)[ -](?P<u>second|minute|hour)\b"),
+    _rule(r"\b(?P<n>\d+)[ -](?P<u>second|minute|hour)\b"),
 )
 _SPEED = (_rule(rf",?\s*\bat (?:a speed of )?(?P<n>{_N}) ?(?P<u>{lx.SPEED_UNIT})(?!\w)"),)
 _FPS = (_rule(rf",?\s*\bat (?P<n>{_N}) ?(?:fps|frames (?:per|a) second)\b"),)
@@ -95,7 +96,8 @@ def take(text: str, *, altitude: bool) -> tuple[str, Modifiers]:
             "altitude_m",
             (
                 _rule(
-                    rf",?\s*\b(?:to|at|up to) (?:an? )?(?:altitude |height )?(?:of )?(?P<n>{_N}) ?(?P<u>{_L})(?: altitude| high)?"
+                    rf",?\s*\b(?:to|at|up to) (?:an? )?(?:altitude |height )?(?:of )?(?P<n>{_N}) ?(?P<u>{_L})"
+                    rf"(?: altitude| high)?"
                 ),
             ),
             lx.metres,

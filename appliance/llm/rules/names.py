@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from appliance.llm.rules import lexicon as lx
 
 KIND = (
-    r"(?:robots?|drones?|rovers?|arms?|uavs?|ugvs?|bots?|carts?|vehicles?|quadcopters?|copters?|quads?|amrs?|agvs?|trucks?|"
+    r"(?:robots?|drones?|rovers?|arms?|uavs?|ugvs?|bots?|carts?|vehicles?|quadcopters?|copters?|"
+    r"quads?|amrs?|agvs?|trucks?|"
     r"machines?|units?|crawlers?|loaders?|forklifts?|tugs?|manipulators?|humanoids?|ones?|of them)"
 )
 _GENERIC = {"robot", "bot", "machine", "unit", "one", "of them", "vehicle"}
@@ -23,11 +24,15 @@ _BY_CAPITAL = rf"[A-Z][A-Za-z]*\d*(?:-[A-Za-z0-9]+)*(?: {_CODE})?(?![\w])"
 _AND = r"(?:\s*,\s*(?:and\s+)?|\s+and\s+|\s*&\s*)"
 
 ONE = re.compile(
-    rf"(?:(?:an?|any|some|one) (?:available |free |single |idle )?{KIND}\b|one of (?:the |our |your )?{KIND}\b|somebody|someone|anyone)",
+    (
+        rf"(?:(?:an?|any|some|one) (?:available |free |single |idle )?{KIND}\b|one of (?:the |our "
+        rf"|your )?{KIND}\b|somebody|someone|anyone)"
+    ),
     re.IGNORECASE,
 )
 ALL = re.compile(
-    rf"(?:all|both|each|every|all of|both of|each of|every one of)(?: of)?(?: the| our| your)?(?: (?:two|three|four|five|six))? ?(?P<kind>{KIND}|them)?\b"
+    rf"(?:all|both|each|every|all of|both of|each of|every one of)(?: of)?(?: the| our| your)"
+    rf"?(?: (?:two|three|four|five|six))? ?(?P<kind>{KIND}|them)?\b"
     rf"|everyone|everybody|the (?P<plural>robots|drones|rovers|arms|uavs|ugvs|bots|carts|vehicles|machines)\b",
     re.IGNORECASE,
 )
@@ -39,10 +44,106 @@ OTHER = re.compile(rf"(?:the other|another|the second)(?: (?:{KIND}))?\b", re.IG
 FIRST = re.compile(rf"(?:one|the first)(?: (?:{KIND}))?\b", re.IGNORECASE)
 PRONOUN = re.compile(r"(?:they|it|he|she|you|we|who|both|them)\b", re.IGNORECASE)
 NOT_NAMES = frozenset(
-    "the a an and then if when while once after before as at in on to it they he she you we i this that these those there finally "
-    "first meanwhile next please all both each every everyone one two three let have make tell ask send get only not no "
-    "yes ok okay could would can will should may might what how who where why which for from with by of or but so now "
-    "also again break over out do does did is are was were be been being has had night mission task note warning".split()
+    [
+        "the",
+        "a",
+        "an",
+        "and",
+        "then",
+        "if",
+        "when",
+        "while",
+        "once",
+        "after",
+        "before",
+        "as",
+        "at",
+        "in",
+        "on",
+        "to",
+        "it",
+        "they",
+        "he",
+        "she",
+        "you",
+        "we",
+        "i",
+        "this",
+        "that",
+        "these",
+        "those",
+        "there",
+        "finally",
+        "first",
+        "meanwhile",
+        "next",
+        "please",
+        "all",
+        "both",
+        "each",
+        "every",
+        "everyone",
+        "one",
+        "two",
+        "three",
+        "let",
+        "have",
+        "make",
+        "tell",
+        "ask",
+        "send",
+        "get",
+        "only",
+        "not",
+        "no",
+        "yes",
+        "ok",
+        "okay",
+        "could",
+        "would",
+        "can",
+        "will",
+        "should",
+        "may",
+        "might",
+        "what",
+        "how",
+        "who",
+        "where",
+        "why",
+        "which",
+        "for",
+        "from",
+        "with",
+        "by",
+        "of",
+        "or",
+        "but",
+        "so",
+        "now",
+        "also",
+        "again",
+        "break",
+        "over",
+        "out",
+        "do",
+        "does",
+        "did",
+        "is",
+        "are",
+        "was",
+        "were",
+        "be",
+        "been",
+        "being",
+        "has",
+        "had",
+        "night",
+        "mission",
+        "task",
+        "note",
+        "warning",
+    ]
 )
 
 

@@ -6,6 +6,7 @@ fits no pattern adds no subtask and costs confidence.
 """
 
 import re
+from typing import Any
 
 from msgspec import Struct
 
@@ -13,60 +14,26 @@ from appliance.llm.rules import lexicon as lx
 from appliance.llm.rules import names
 from appliance.llm.rules.clauses import Clause, Reader, Who
 from appliance.llm.rules.graph import Graph, Snapshot
-from appliance.llm.rules.handling import things
 from appliance.llm.rules.phrases import Step
+from appliance.llm.rules.wording import (
+    BETWEEN,
+    CHECKS,
+    DONE,
+    FILE,
+    HEADING,
+    HERE,
+    LEAD_ALL,
+    LEAD_BESIDE,
+    LEAD_FIRST,
+    PREFIX,
+    TRAILING,
+    clean,
+    first_chunk,
+    renamed,
+    sentences,
+)
 from appliance.model import RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue
-
-_QUOTE = re.compile(
-    r"[\"\u201c]([^\"\u201c\u201d]{1,400})[\"\u201d]|(?<![\w])['\u2018]([^'\u2018\u2019]{1,400})['\u2019](?!\w)"
-)
-_LEAD_ALL = re.compile(
-    r"(?:and )?(?:then|after that|after this|afterwards|afterward|thereafter|next|finally|lastly|subsequently|in the end|"
-    r"(?:once|when|as soon as) (?:(?:you are|you're|that is|that's|all(?: of (?:that|this|them))? (?:is|are)|everything is|it is|it's|this is) )?(?:all )?(?:done|finished|complete|ready))\b[,:]?\s*",
-    re.IGNORECASE,
-)
-_LEAD_BESIDE = re.compile(
-    r"(?:and )?(?:meanwhile|in the meantime|in the meanwhile|at the same time|simultaneously|in parallel|concurrently)\b[,:]?\s*",
-    re.IGNORECASE,
-)
-_LEAD_FIRST = re.compile(r"(?:first|firstly|first of all|to begin with|to start with)\b[,:]?\s*", re.IGNORECASE)
-_PREFIX = re.compile(
-    r"(?P<word>while|whilst|as soon as|as|before|(?:only )?(?:after|once|when|whenever|if)|in case)\s+(?P<rest>.+)",
-    re.IGNORECASE | re.DOTALL,
-)
-_BETWEEN = re.compile(
-    r"(?P<then>[,;]?\s+(?:and |but )?(?:then|after that|afterwards|after which|thereafter|next|finally|lastly|followed by)\b,?\s+)"
-    r"|(?P<beside>[,;]?\s+(?:and |but |all )?,?\s*(?:while|whilst|meanwhile|in the meantime|at the same time as|at the same time|simultaneously|in parallel|as (?=(?:you|it|he|she|they)\b))\b,?\s+(?:also )?)"
-    r"|(?P<before>,?\s+(?:but )?before\s+)"
-    r"|(?P<after>,?\s+(?:but )?(?:only )?after\s+)"
-    r"|(?P<when>,?\s+(?:and |but )?(?:only )?(?:as soon as|once|when|if)\s+)"
-    r"|(?P<list>\s*,\s*(?:and\s+|but\s+)?(?:also\s+)?|\s+and\s+(?:also\s+)?|\s+-\s+|\s*:\s+)",
-    re.IGNORECASE,
-)
-_DONE = re.compile(
-    r"(?P<who>.+?)(?:'s|'re| is| are| has| have| gets?| get| was| were)?(?: all| both)? (?:been )?"
-    r"(?:done|finished|finnished|complete|completed|there|ready|through|arrived|answered|replied|docked|airborne|landed|in position|in place|back|home|in|over|up|"
-    r"returned|it|at .+|taken off|loaded|charged|the .+ there)(?: (?:there|both|it|this|that|up))?",
-    re.IGNORECASE,
-)
-_CHECKS = frozenset(
-    {
-        "inspect",
-        "find",
-        "detect",
-        "count",
-        "ask",
-        "read",
-        "measure",
-        "scan_thermal",
-        "compare",
-        "track",
-        "wait_for",
-        "photograph",
-    }
-)
-_TRAILING = re.compile(r",\s*(?P<name>[A-Za-z][\w-]*(?: (?:\d+|[A-Z]))?)(?=\s*(?:$|,\s))")
 
 
 class Reading(Struct):
@@ -85,9 +52,8 @@ class Parser:
         roster = None if robots is None else tuple(robot.id for robot in robots)
         self._names = names.Names(roster, tuple(robot.id for robot in robots or () if robot.flies))
         self._quotes: list[str] = []
-        self._reader = Reader(
-            catalogue, self._names, (lambda name: site is not None and site.find(name) is not None), self._quotes
-        )
+        self._site = site
+        self._reader = Reader(catalogue, self._names, self._known_place, self._quotes)
         self._graph = Graph(catalogue)
         self._said = 0
         self._lost = 0.0
@@ -96,46 +62,30 @@ class Parser:
         """Whom an elided subject means."""
         self._anys = 0
         self._last: Clause | None = None
+        self._whole: Clause | None = None
+        """The last clause that was read while splitting a sentence."""
+        self._all_beside = False
+        """The sentence said in advance that all of it runs together."""
+        self._source = ""
+        """A file that was put before what is done with it."""
+
+    def _known_place(self, name: str) -> bool:
+        return self._site is not None and self._site.find(name) is not None
 
     def parse(self, instruction: str) -> Reading:
         """Read the whole instruction."""
-        for sentence in self._sentences(instruction):
+        for sentence in sentences(instruction, self._quotes, self._names.sure.pattern):
             self._sentence(sentence)
         subtasks = self._graph.subtasks()
         labels = {each.robot for each in subtasks} | {
             name for each in subtasks for name in each.params.get("robots", ())
         }
         if "any1" in labels and "any2" not in labels:
-            subtasks = tuple(_renamed(each, "any1", "any") for each in subtasks)
+            subtasks = tuple(renamed(each, "any1", "any") for each in subtasks)
+        elif "any2" in labels and "any" in labels:
+            subtasks = tuple(renamed(each, "any", "any1") for each in subtasks)
         confidence = max(0.0, 1.0 - self._lost / self._said) if self._said and subtasks else 0.0
         return Reading(subtasks, round(confidence, 3), tuple(self._pieces[:8]))
-
-    # --- text to sentences ----------------------------------------------------------------------------------------
-
-    def _sentences(self, text: str) -> list[str]:
-        text = text.replace("\x00", " ").replace("\u2013", "-").replace("\u2014", " - ").replace("\u2019", "'")
-
-        def keep(match: re.Match[str]) -> str:
-            said = match[1] or match[2]
-            self._quotes.append(said.strip())
-            ends = said.rstrip().endswith((".", "?", "!"))
-            follows = re.match(r"\s+[A-Z]", text[match.end() :])
-            return f"\x00{len(self._quotes) - 1}\x00" + (". " if ends and follows else "")
-
-        text = _QUOTE.sub(keep, text)
-        text = re.sub(r"[A-Za-z]+", lambda match: lx.spell(match[0]), text)
-        text = re.sub(r"(?:^|(?<=[:\n]))\s*(?:[-*\u2022]) +", ". ", text)
-        marks = re.findall(r"(?:(?<=\s)|^)\(?\d{1,2}[.)]\s", text)
-        if len(marks) > 1:
-            text = re.sub(
-                r"\s*(?:(?<=\s)|^)\(?(\d{1,2})[.)]\s+", lambda match: " " if match[1] == "1" else ", then ", text
-            )
-            text = re.sub(r"[.;]\s*, then ", ", then ", text)
-        text = re.sub(r"\b(Dr|Mr|Mrs|Ms|St|No|approx)\.", r"\1", text)
-        text = re.sub(r"(?:each|all|both|every one) of (?:the )?(?=\w+s? (?:\d+|[A-Z])\b)", "", text)
-        text = re.sub(r"\b([A-Za-z]+)s ((?:(?:\d+|[A-Z]),? )+and (?:\d+|[A-Z]))\b", _spread, text)
-        parts = re.split(r"(?<=[\w\x00)\]])[.!?;]+(?=\s|$)|\n+|^\. |\s\. ", text)
-        return [part.strip() for part in parts if part and part.strip(" .,;:!?")]
 
     # --- one sentence ---------------------------------------------------------------------------------------------
 
@@ -145,23 +95,38 @@ class Parser:
         beside = False
         wait_all = False
         for _ in range(3):
-            if match := _LEAD_ALL.match(text):
+            if match := LEAD_ALL.match(text):
                 wait_all, text = True, text[match.end() :]
-            elif match := _LEAD_BESIDE.match(text):
+            elif match := LEAD_BESIDE.match(text):
                 beside, text = True, text[match.end() :]
-            elif match := _LEAD_FIRST.match(text):
+            elif match := LEAD_FIRST.match(text):
                 text = text[match.end() :]
         if not text.strip(" ,.:"):
             return
         start = self._graph.new_sentence(parallel=beside)
         if wait_all:
             self._graph.barrier |= self._graph.lasts()
+            self._graph.sentence.barrier = self._graph.barrier
+        self._all_beside = beside and not self._graph.steps
         self._last = None
         text = self._spoken_to(text)
         if not text.strip(" ,.:"):
             return
+        if (match := FILE.fullmatch(text)) and self._reader.starts(first_chunk(match["rest"])):
+            self._source, text = match["file"], match["rest"]
+        elif (
+            (match := HEADING.fullmatch(text))
+            and not PREFIX.match(text)
+            and not self._reader.starts(text)
+            and match["rest"]
+        ):
+            self._lost += len(match["head"].split())
+            text = self._spoken_to(match["rest"])
+        if re.search(r"\w first[.!]?$", text) and self._graph.steps:
+            self._earlier(text)
+            return
         text = self._trailing(text)
-        if (match := _PREFIX.fullmatch(text)) and self._prefixed(match["word"].lower(), match["rest"], start):
+        if (match := PREFIX.fullmatch(text)) and self._prefixed(match["word"].lower(), match["rest"], start):
             return
         if self._leading_place(text, start):
             return
@@ -206,19 +171,19 @@ class Parser:
         if not text.strip():
             return True
         if (
-            _PREFIX.match(text)
-            or _LEAD_FIRST.match(text)
+            PREFIX.match(text)
+            or LEAD_FIRST.match(text)
             or re.match(r"(?:at|in) (?!the same)|please|what|i\b|could|can|would", text, re.IGNORECASE)
         ):
             return True
         first = re.match(r"[A-Za-z']+", text)
         return bool(first and first[0].lower() in lx.LEMMA and not re.match(r"\w+(?:es|s)\b", first[0])) or bool(
-            first and self._reader.starts(_BETWEEN.split(text)[0] or text)
+            first and self._reader.starts(BETWEEN.split(text)[0] or text)
         )
 
     def _trailing(self, text: str) -> str:
         """Take a name off the end ("Inspect the pump, Heron") or the middle and speak to it."""
-        for match in _TRAILING.finditer(text):
+        for match in TRAILING.finditer(text):
             name = match["name"]
             sure = self._names.sure.fullmatch(name)
             if not sure and not (
@@ -254,9 +219,9 @@ class Parser:
             condition, main = rest[: match.start()], rest[match.end() :]
             vocative = self._names.leading(main)
             if not (
-                self._reader.starts(_first_chunk(main))
+                self._reader.starts(first_chunk(main))
                 or vocative
-                or _LEAD_FIRST.match(main)
+                or LEAD_FIRST.match(main)
                 or re.match(r"at |in ", main)
             ):
                 continue
@@ -279,7 +244,10 @@ class Parser:
     def _condition(self, word: str, text: str) -> None:
         """Make what follows in this sentence wait for a condition: work that is done, or an event."""
         graph = self._graph
-        done = _DONE.fullmatch(text)
+        if graph.steps and HERE.fullmatch(text):
+            graph.barrier |= graph.lasts()
+            return
+        done = DONE.fullmatch(text)
         if graph.steps and done:
             robot = self._names.known(done["who"]) or (
                 self._names.resolve(done["who"]) if self._names.resolve(done["who"]) in graph.tails else None
@@ -287,12 +255,12 @@ class Parser:
             graph.barrier |= graph.tails[robot] if robot in graph.tails else graph.lasts()
             return
         old = len(graph.steps)
-        if self._reader.starts(_first_chunk(text)) and word != "if":
+        if self._reader.starts(first_chunk(text)) and word != "if":
             self._clauses(text, None)
             if len(graph.steps) > old:
                 graph.barrier |= graph.lasts(range(old, len(graph.steps)))
                 return
-        checked = any(skill in _CHECKS for skill, _, _ in graph.steps)
+        checked = any(skill in CHECKS for skill, _, _ in graph.steps)
         if word in ("if", "in case"):
             graph.barrier |= graph.lasts()
             if not checked:
@@ -313,7 +281,7 @@ class Parser:
         match = re.match(
             r"(?:at|in|on|inside) (?P<p>.+?), (?P<rest>(?!and )[^,]*\b.*)", text, re.IGNORECASE | re.DOTALL
         )
-        while match and not self._reader.starts(_first_chunk(match["rest"])):
+        while match and not self._reader.starts(first_chunk(match["rest"])):
             match = re.match(
                 rf"(?:at|in|on|inside) (?P<p>{re.escape(match['p'])}, .+?), (?P<rest>(?!and ).+)",
                 text,
@@ -324,7 +292,7 @@ class Parser:
         if re.match(r"the (?:gateway|server|edge)\b", match["p"], re.IGNORECASE):
             self._clauses(match["rest"], start)
             return True
-        for place in things(match["p"]):
+        for place in lx.things(match["p"]):
             where = self._reader.place(place)
             self._graph.add(self._doers(Who()), [Step("goto", {"place": where})], beside=start)
             self._reader.mentions.place = where
@@ -337,14 +305,15 @@ class Parser:
         """Split a sentence into (connective, clause), where both sides of a connective are clauses."""
         found: list[tuple[str, str]] = []
         kind, begin, where = "list", 0, 0
-        while match := _BETWEEN.search(text, where):
+        while match := BETWEEN.search(text, where):
             left, right = text[begin : match.start()], text[match.end() :]
             this = match.lastgroup or "list"
+            this = "if" if this == "when" and match[0].split()[-1].lower() == "if" else this
             where = match.end()
             if not left.strip(" ,"):
                 kind, begin = (this if this != "list" else kind), match.end()
                 continue
-            if "beside" == this and not right.strip(" ,."):
+            if this == "beside" and not right.strip(" ,."):
                 continue
             if self._breaks(this, left, right):
                 found.append((kind, left))
@@ -353,14 +322,18 @@ class Parser:
         return found
 
     def _breaks(self, kind: str, left: str, right: str) -> bool:
-        head = _first_chunk(right)
-        readable = self._reader.starts(left)
-        gap = self._gapped(head, self._reader.read(left, speaking_to=self._to)) is not None if readable else False
-        if kind in ("before", "after", "when"):
+        head = first_chunk(right)
+        clause = self._reader.read(left, speaking_to=self._to) or self._gapped(left, self._whole)
+        readable = clause is not None or self._reader.starts(left)
+        gapped = self._gapped(head, clause) if clause is not None else None
+        gap = gapped is not None
+        if clause is not None:
+            self._whole = clause
+        if kind in ("before", "after", "when", "if"):
             if re.search(r"\b(?:wait|until|till|waits)\b", left) and kind != "before":
                 return False
             return readable and (
-                self._reader.starts(head) or _DONE.fullmatch(_clean(right)) is not None or kind == "when"
+                self._reader.starts(head) or DONE.fullmatch(clean(right)) is not None or kind in ("when", "if")
             )
         if kind == "beside":
             return readable or self._reader.starts(head)
@@ -372,14 +345,23 @@ class Parser:
             return True
         if kind == "list" and re.match(r"(?:once|when|after|before|while|if|as soon as)\b", right, re.IGNORECASE):
             return True
-        match = _BETWEEN.match(right) or None
+        match = BETWEEN.match(right) or None
         return match is not None and match.lastgroup != "list"
 
     def _gapped(self, text: str, previous: Clause | None) -> Clause | None:
         """Read "robot 3 pallet 62 at dock 5" after "robot 2 picks up pallet 61 at dock 4"."""
-        if previous is None or previous.who.kind not in ("named", "one", "first", "other", "all"):
+        if previous is None:
             return None
-        found = self._names.leading(_clean(text))
+        if (match := re.match(r"(to|of|from|for) ", clean(text), re.IGNORECASE)) and previous.prefix.lower().endswith(
+            " " + match[1].lower()
+        ):
+            clause = self._reader.read(f"{previous.prefix.rsplit(' ', 1)[0]} {clean(text)}", speaking_to=self._to)
+            if clause is not None:
+                clause.prefix = previous.prefix
+            return clause
+        if previous.who.kind not in ("named", "one", "first", "other", "all"):
+            return None
+        found = self._names.leading(clean(text))
         if found is None or len(found[0]) != 1 or not found[1].strip():
             return None
         rest = found[1].strip()
@@ -395,51 +377,86 @@ class Parser:
         return None
 
     def _clauses(self, text: str, start: Snapshot | None) -> None:
-        beside = start
         sentence = self._graph.snapshot() if start is None else start
         pending: list[set[int]] = []
-        for kind, piece in self._chunks(text):
-            if kind in ("when",):
-                match = re.match(r"(?P<c>.+?),\s*(?P<main>.+)", piece, re.DOTALL)
-                if match and self._reader.starts(_first_chunk(match["main"])):
-                    self._condition("when", match["c"])
-                    self._clauses(match["main"], None)
-                elif pending:
-                    old = len(self._graph.steps)
-                    self._late_condition(piece, pending[-1], sentence)
-                    del old
-                continue
+        chunks = self._chunks(text)
+        for index, (kind, piece) in enumerate(chunks):
+            if kind in ("when", "if"):
+                if halves := self._halves(piece):
+                    self._condition(kind, halves[0])
+                    self._clauses(halves[1], None)
+                    continue
+                if pending:
+                    # All that follows belongs to the condition: "report once A has done X and B has done Y".
+                    rest = " and ".join(each for _, each in chunks[index:])
+                    self._late_condition(kind, rest, pending[-1], sentence)
+                return
             if (
                 kind == "list"
-                and (match := _PREFIX.fullmatch(piece.strip()))
+                and (match := PREFIX.fullmatch(piece.strip()))
                 and self._prefixed(match["word"].lower(), match["rest"], None)
             ):
                 continue
-            piece = self._spoken_to(piece.strip()) if kind != "list" or not pending or ":" in piece else piece
-            clause = self._reader.read(piece, speaking_to=self._to) or self._gapped(piece, self._last)
+            said = self._spoken_to(piece.strip()) if kind != "list" or not pending or ":" in piece else piece
+            clause = self._reader.read(said, speaking_to=self._to) or self._gapped(said, self._last)
             if clause is None:
-                self._lose(piece, len(piece.split()))
+                self._lose(said, len(said.split()))
                 continue
             self._lost += clause.lost
-            firsts, ends = self._emit(kind, clause, beside, sentence)
+            anew = not pending or clause.who.kind not in ("elided", "pronoun")
+            how = "beside" if self._all_beside and pending and kind == "list" else kind
+            firsts, ends = self._emit(how, clause, start if anew else None)
             if kind == "after" and pending:
                 self._graph.order(ends, pending[-1])
             pending.append(firsts)
-            beside = start if start is not None and clause.who.kind not in ("elided", "pronoun") else None
 
-    def _late_condition(self, text: str, firsts: set[int], sentence: Snapshot) -> None:
+    def _earlier(self, text: str) -> None:
+        """Read "Close the clamp first", said after what it comes before."""
+        graph = self._graph
+        clause = self._reader.read(re.sub(r"\s+first[.!]?$", "", text), speaking_to=self._to)
+        if clause is None:
+            self._lose(text, len(text.split()))
+            return
+        self._lost += clause.lost
+        later = {node for node in range(len(graph.steps)) if not graph.before[node]}
+        tails = dict(graph.tails)
+        _, ends = graph.add(list(self._doers(clause.who)), clause.steps, beside=Snapshot({}, frozenset(), frozenset()))
+        graph.order(ends, later)
+        graph.tails = {**graph.tails, **tails}
+
+    def _halves(self, text: str) -> tuple[str, str] | None:
+        """Split "you find him, notify the guard" (the comma may be missing) into condition and order."""
+        for match in re.finditer(r",\s*", text):
+            if self._reader.starts(first_chunk(text[match.end() :])):
+                return text[: match.start()], text[match.end() :]
+        for match in re.finditer(r"\s+(?=([a-z]+)\b)", text):
+            condition = text[: match.start()]
+            if match[1] in lx.LEMMA and lx.LEMMA[match[1]] == match[1] and len(condition.split()) > 1:
+                about = DONE.fullmatch(condition) or self._reader.starts(condition)
+                if about and self._reader.starts(first_chunk(text[match.end() :])):
+                    return condition, text[match.end() :]
+        return None
+
+    def _late_condition(self, kind: str, text: str, firsts: set[int], sentence: Snapshot) -> None:
         """Read "A once B", said in that order: B comes first."""
         graph = self._graph
         old = len(graph.steps)
-        if _DONE.fullmatch(_clean(text)) and len(graph.steps) > len(firsts):
+        if DONE.fullmatch(clean(text)) and len(graph.steps) > len(firsts):
             graph.order(graph.lasts(set(range(old)) - firsts), firsts)
             return
         tails, thread = dict(graph.tails), graph.thread
         graph.tails, graph.thread, graph.barrier = dict(sentence.tails), sentence.thread, sentence.barrier
         graph.scope = set()
-        if self._reader.starts(_first_chunk(text)):
+        if self._reader.starts(first_chunk(text)):
             self._clauses(text, None)
             graph.order(graph.lasts(range(old, len(graph.steps))), firsts)
+            graph.tails, graph.thread = {**graph.tails, **tails}, thread
+            return
+        if kind == "when":
+            step = Step("wait_for", {"event": self._reader.unquote(clean(text))})
+            robots = self._to[:1] if self._to != ["all"] else ["any"]
+            _, ends = graph.add(robots, [step], beside=Snapshot(dict(sentence.tails), frozenset(), graph.barrier))
+            graph.order(ends, firsts)
             graph.tails, graph.thread = {**graph.tails, **tails}, thread
             return
         graph.tails, graph.thread = tails, thread
@@ -461,15 +478,12 @@ class Parser:
             return mentions.robots or self._to
         return self._to
 
-    def _emit(
-        self, kind: str, clause: Clause, beside: Snapshot | None, sentence: Snapshot
-    ) -> tuple[set[int], set[int]]:
+    def _emit(self, kind: str, clause: Clause, beside: Snapshot | None) -> tuple[set[int], set[int]]:
         graph = self._graph
         assigned = [step.params["_robot"] for step in clause.steps if "_robot" in step.params]
         robots = assigned or self._doers(clause.who)
         explicit = clause.who.kind not in ("elided", "pronoun")
-        fresh = explicit and (kind != "list" or robots != self._to or clause.who.kind == "named")
-        computes = all(graph._catalogue.skills[step.skill].runs == "compute" for step in clause.steps)  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
+        computes = all(graph.catalogue.skills[step.skill].runs == "compute" for step in clause.steps)
         if kind in ("then", "before") and (explicit or computes) and graph.scope:
             graph.barrier |= graph.lasts(graph.scope)
         if kind in ("beside", "after"):
@@ -484,7 +498,8 @@ class Parser:
                 beside = graph.previous
         if explicit and robots != self._to:
             graph.thread = graph.thread if kind == "then" else frozenset()
-        del fresh
+        if self._source:
+            clause.steps[0].params = self._with_source(clause.steps[0])
         firsts, ends = graph.add(list(robots), clause.steps, beside=beside)
         if explicit:
             self._names.seen.update(robots)
@@ -496,6 +511,11 @@ class Parser:
         self._remember(clause)
         self._last = clause
         return firsts, ends
+
+    def _with_source(self, step: Step) -> dict[str, Any]:
+        manifest = self._graph.catalogue.skills.get(step.skill)
+        source, self._source = self._source, ""
+        return {"source": source, **step.params} if manifest and "source" in manifest.params else step.params
 
     def _remember(self, clause: Clause) -> None:
         mentions = self._reader.mentions
@@ -521,29 +541,3 @@ class Parser:
         if bare:
             self._pieces.append(said)
             self._lost += words
-
-
-def _first_chunk(text: str) -> str:
-    """Return the text up to its first connective, or a little more where that is no clause yet."""
-    match = _BETWEEN.search(text, 1)
-    return text[: match.start()] if match else text
-
-
-def _clean(text: str) -> str:
-    return text.strip(" ,.;:!?-\n\t")
-
-
-def _spread(match: re.Match[str]) -> str:
-    """Write "goals 1, 2 and 3" as "goal 1, goal 2 and goal 3"."""
-    head = match[1]
-    items = re.findall(r"\d+|\b[A-Z]\b", match[2])
-    named = [f"{lx.singular(head + 's')} {item}" for item in items]
-    return ", ".join(named[:-1]) + " and " + named[-1]
-
-
-def _renamed(subtask: Subtask, old: str, new: str) -> Subtask:
-    params = dict(subtask.params)
-    if "robots" in params:
-        params["robots"] = [new if name == old else name for name in params["robots"]]
-    robot = new if subtask.robot == old else subtask.robot
-    return Subtask(id=subtask.id, skill=subtask.skill, robot=robot, params=params, after=subtask.after)
