@@ -1,5 +1,7 @@
 """Each check of `swiftbot doctor` against machines that lack one thing."""
 
+# ruff: noqa: ARG002, D102 - fakes have the signatures and the docstrings of what they stand for
+
 from collections.abc import Mapping
 from pathlib import Path
 
