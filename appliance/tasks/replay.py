@@ -86,12 +86,13 @@ def replay(path: Path) -> ReplayReport:
         chunks = message.key.split("/")
         if len(chunks) < 5 or chunks[2] != "task" or chunks[4] not in ("transition", "record"):
             continue
-        folding = tasks.setdefault(chunks[3], _Folding())
         try:
             if chunks[4] == "transition":
-                folding.take(msgspec.json.decode(message.payload, type=Transition))
+                event = msgspec.json.decode(message.payload, type=Transition)
+                tasks.setdefault(event.task, _Folding()).take(event)
             else:
-                folding.logged = msgspec.json.decode(message.payload, type=TaskRecord)
+                record = msgspec.json.decode(message.payload, type=TaskRecord)
+                tasks.setdefault(record.id, _Folding()).logged = record
         except msgspec.DecodeError:
             counts["unreadable"] += 1
     if not tasks:
