@@ -97,21 +97,20 @@ class Copter:
     async def goto(self, args: GotoArgs) -> Done:
         """Fly through the waypoints by an uploaded mission and wait for arrival at the last."""
         vehicle = self._vehicle
-        start = self._position()
+        start = await self._fix()
         points = check_way(self._site, start, args, flies=True)
         ground_z = start.z - vehicle.relative_m
         grounded = not vehicle.airborne
         altitude_z = ground_z + self._config.takeoff_altitude_m if grounded else max(start.z, ground_z + _LOWEST_M)
         way = cruise(points, min(altitude_z, self._site.altitude_limit_m))
         items = self._mission(way, ground_z, args.speed_mps, grounded=grounded)
-        if grounded:
-            await upload(vehicle, items, patience=self._patience)
-            await self._mode("GUIDED")
-            await self._arm()
-        else:
+        if vehicle.armed:
             # Held in place first: an autopilot does not take a new mission while it flies the old one.
             await self._mode("GUIDED")
-            await upload(vehicle, items, patience=self._patience)
+        await upload(vehicle, items, patience=self._patience)
+        if not vehicle.armed:
+            await self._mode("GUIDED")
+            await self._arm()
         vehicle.forget_mission()
         await self._mode("AUTO")
         await command(vehicle, dialect.MISSION_START, 0, 0, patience=self._patience)
@@ -133,7 +132,7 @@ class Copter:
         altitude = self._config.takeoff_altitude_m if args.altitude_m is None else args.altitude_m
         in_range("takeoff", "altitude_m", altitude, _LOWEST_M, max(self._site.altitude_limit_m, _LOWEST_M))
         vehicle = self._vehicle
-        self._position()
+        await self._fix()
         await self._mode("GUIDED")
         if not vehicle.airborne:
             await self._arm()
@@ -317,6 +316,11 @@ class Copter:
 
     def _landed(self) -> bool:
         return not self._vehicle.armed
+
+    async def _fix(self) -> Pose:
+        """Wait a little for the position: a vehicle that has just come online has not told it yet."""
+        await self._confirm(lambda: self._vehicle.fixed)
+        return self._position()
 
     def _position(self) -> Pose:
         pose = self._vehicle.pose

@@ -29,6 +29,7 @@ class Endpoint(asyncio.DatagramProtocol):
         self.refused: dict[str, int] = {} if refused is None else refused
         self._on_frame = on_frame
         self._transport: asyncio.DatagramTransport | None = None
+        self._closed = asyncio.Event()
 
     @classmethod
     async def open(
@@ -66,11 +67,12 @@ class Endpoint(asyncio.DatagramProtocol):
             self._transport.sendto(raw, to)
         return raw
 
-    def close(self) -> None:
-        """Close the socket."""
+    async def close(self) -> None:
+        """Close the socket; the port is free when it returns."""
         if self._transport is not None:
-            self._transport.close()
+            self._transport.abort()
             self._transport = None
+            await self._closed.wait()
 
     def count(self, kind: str) -> None:
         """Count one piece of bad input."""
@@ -88,6 +90,11 @@ class Endpoint(asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport (asyncio)."""
         self._transport = cast("asyncio.DatagramTransport", transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Note that the socket is closed (asyncio)."""
+        del exc
+        self._closed.set()
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
         """Take in a datagram (asyncio)."""

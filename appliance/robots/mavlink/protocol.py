@@ -142,6 +142,7 @@ async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience)
                 silent += 1
                 last = None
                 sent.clear()
+                await asyncio.sleep(patience.timeout_s)
                 _send_count(vehicle, items)
                 continue
             reason = f"{label('MAV_MISSION_RESULT', answer.type)} {vehicle.text}".strip()
@@ -150,10 +151,11 @@ async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience)
                 f"{vehicle.name} refuses the mission: {reason}",
                 remedy="look at the waypoints and the vehicle's fence",
             )
+    said = f": {vehicle.text}" if vehicle.text else ""
     raise RobotFailure(
         "robot",
-        f"{vehicle.name} does not answer the upload of its mission",
-        remedy="check its radio link",
+        f"{vehicle.name} did not take its mission in {patience.tries} tries{said}",
+        remedy="check its radio link, and that nobody else is uploading",
         retryable=True,
     )
 

@@ -114,7 +114,7 @@ class Station:
         self._vehicles.clear()
         self._by_source.clear()
         for endpoint in self._endpoints:
-            endpoint.close()
+            await endpoint.close()
         self._endpoints.clear()
         if self._watch is not None:
             self._watch.close()

@@ -113,7 +113,7 @@ class Simulation:
                 except TimeoutError:
                     continue
         finally:
-            self._endpoint.close()
+            await self._endpoint.close()
 
     def _heard(self, frame: Frame, address: tuple[str, int]) -> None:
         if address != self._gateway_address(address) or self._lost():

@@ -19,10 +19,12 @@ class FakeSession:
         self.queries: list[bytes] = []
         self.answer: Callable[[bytes], Awaitable[bytes]] | None = None
 
-    def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:
+    def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:  # noqa: ARG002
+        """Keep a put."""
         self.puts.append((key, payload))
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:  # noqa: ARG002
+        """Answer as `answer` does."""
         self.queries.append(payload)
         if self.answer is None:
             raise UnreachableError(f"nobody answers {key}")
@@ -40,23 +42,29 @@ class FakeStore:
         self.values: dict[str, bytes] = {}
 
     async def get(self, key: str) -> bytes | None:
+        """Read."""
         return self.values.get(key)
 
     async def put(self, key: str, value: bytes) -> None:
+        """Write."""
         self.values[key] = value
 
     async def delete(self, key: str) -> None:
+        """Remove."""
         self.values.pop(key, None)
 
     async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
+        """List."""
         return [(key, value) for key, value in self.values.items() if key.startswith(prefix)]
 
 
 @pytest.fixture
 def session() -> FakeSession:
+    """Return a fake session."""
     return FakeSession()
 
 
 @pytest.fixture
 def store() -> FakeStore:
+    """Return an empty store."""
     return FakeStore()

@@ -19,11 +19,13 @@ SITE = Site(
 
 
 def red(picture: Image.Image) -> NDArray[np.bool_]:
+    """Tell which pixels are red."""
     pixels = np.asarray(picture.convert("RGB"), dtype=int)
     return (pixels[..., 0] > 90) & (pixels[..., 1] < 60) & (pixels[..., 2] < 60)
 
 
 def look(world: World, target: str, pose: Pose, **size: int) -> Image.Image:
+    """Take a picture of a target."""
     return camera.render(world, pose, aim(world, target, pose, camera.EYE_M), robot="r", **size)
 
 

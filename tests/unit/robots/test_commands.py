@@ -20,6 +20,7 @@ WAY: dict[str, Any] = {"waypoints": [{"x": 1.0, "y": 2.0}]}
 
 
 def order(identity: str, verb: str = "goto", attempt: int = 1, **args: Any) -> RobotCommand:
+    """Make a command of task t, subtask s1."""
     if verb == "goto" and not args:
         args = WAY
     return RobotCommand(id=identity, verb=verb, args=args, task="t", subtask="s1", attempt=attempt)
@@ -52,6 +53,8 @@ class Robot:
         )
 
     def act(self, name: str) -> Any:
+        """Make a verb that waits for the gate."""
+
         async def run(args: Any) -> Done:
             await self.gate.wait()
             self.done.append(name)
@@ -59,17 +62,21 @@ class Robot:
 
         return run
 
-    async def at_once(self, args: Any) -> Done:
+    async def at_once(self, args: Any) -> Done:  # noqa: ARG002
+        """Do a verb at once."""
         return Done({"ok": True})
 
     def ready(self) -> None:
+        """Raise the problem there is."""
         if self.problem is not None:
             raise self.problem
 
     async def halt(self) -> None:
+        """Count halts."""
         self.halts += 1
 
     async def begin(self, command: RobotCommand) -> "asyncio.Task[RobotReply]":
+        """Give a command and let it get under way."""
         task = asyncio.create_task(self.desk.execute(command))
         for _ in range(10):
             await asyncio.sleep(0)
@@ -78,6 +85,7 @@ class Robot:
 
 @pytest.fixture
 async def robot(session: Any) -> Robot:
+    """Return a robot."""
     return Robot(session)
 
 

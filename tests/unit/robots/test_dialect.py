@@ -10,12 +10,14 @@ _CODEC = Codec(7, 1)
 
 
 def heartbeat() -> bytes:
+    """Return a vehicle's heartbeat frame."""
     return _CODEC.pack(
         make("HEARTBEAT", type=2, autopilot=3, base_mode=0, custom_mode=4, system_status=4, mavlink_version=3)
     )
 
 
 def read(data: bytes) -> list[Frame | Damage]:
+    """Read bytes as a gateway does."""
     return list(Codec(245, 191).read(data))
 
 

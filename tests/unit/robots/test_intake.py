@@ -9,6 +9,7 @@ from appliance.robots.intake import MAX_BYTES, read_request
 
 
 def message(payload: bytes, at_ns: int = 5_000_000_000) -> Message:
+    """Make a put of rover_1."""
     return Message("swiftbot/f/robot/rover_1/task", payload, deleted=False, at_ns=at_ns, encoding="application/json")
 
 

@@ -12,6 +12,7 @@ pytestmark = pytest.mark.anyio
 
 
 def order(identity: str, attempt: int = 1, task: str = "t", subtask: str = "s1") -> RobotCommand:
+    """Make a command."""
     return RobotCommand(id=identity, verb="goto", task=task, subtask=subtask, attempt=attempt)
 
 

@@ -17,6 +17,7 @@ SITE = Site(
 
 
 def way(*points: tuple[float, float], speed: float | None = None, z: float | None = None) -> GotoArgs:
+    """Make a goto."""
     return GotoArgs(waypoints=tuple(Waypoint(x, y, z) for x, y in points), speed_mps=speed)
 
 
