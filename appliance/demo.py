@@ -21,7 +21,7 @@ from appliance.plane.settings import PlaneConfig
 from appliance.tasks.replay import ReplayReport, replay
 
 INSTRUCTIONS = (
-    "Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator",
+    "Rover_1: go to dock 3, photograph the red box, detect red boxes and report to the operator",
     (
         "Drone_1 take off to 10 m, go to goal 2 and land, while Rover_1 fetches the red box from dock 3 "
         "and places it at dock 2"

@@ -26,7 +26,7 @@ from appliance.tasks.replay import replay
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 
-LOOK = "Rover_1: go to the shelf, photograph the shelf, detect red boxes and report to the operator"
+LOOK = "Rover_1: go to dock 3, photograph the red box, detect red boxes and report to the operator"
 FETCH = "Rover_1: go to dock 3, pick the red box, then go to dock 2 and place the red box at dock 2"
 
 
