@@ -120,7 +120,7 @@ def brief(record: SubtaskRecord) -> str:
         elif isinstance(value, list):
             shown.append(f"{key}: {len(value)}")  # pyright: ignore[reportUnknownArgumentType]
         else:
-            shown.append(f"{key}={str(value)[:60]}")
+            shown.append(f"{key}={' '.join(str(value).split())[:60]}")
     return " ".join(shown)[:160]
 
 

@@ -107,6 +107,9 @@ async def test_an_instruction_becomes_results_in_warm_containers_and_replays(fle
                 assert each.container
         photo = next(each for each in first.subtasks if each.subtask.skill == "photograph")
         assert photo.result is not None
+        detect = next(each for each in first.subtasks if each.subtask.skill == "detect")
+        assert detect.result is not None
+        assert detect.result["count"] == 1
         gateways = client.plane.registry.gateways
         assert set(gateways) == set(fleet.gateways)
         # The promise of the idle gateway's footprint, model not loaded.
