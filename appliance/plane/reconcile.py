@@ -16,6 +16,7 @@ from msgspec import Struct
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.plane.dht import Dht, Found, StoreAsk
+from appliance.plane.keys import check_name
 from appliance.plane.membership import Membership
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
@@ -231,6 +232,7 @@ class Reconciler:
     # --- answering --------------------------------------------------------------------------------------------
 
     async def _on_digest(self, asked: DigestAsk) -> DigestList:
+        check_name(asked.asker, "gateway")
         if not asked.joining:
             await self._until_seen(asked.asker)
         ring = self._membership.ring.with_member(asked.asker)

@@ -30,7 +30,8 @@ class Exchange(Struct, frozen=True, kw_only=True, omit_defaults=True):
     gateway: str
     request: Raw
     duration_ms: float
-    reply: Raw | None = None
+    reply: Raw = Raw(b"null")
+    """JSON null where there is an `error` (a union with None would not be decoded as raw JSON)."""
     error: ErrorReply | None = None
 
 
@@ -90,7 +91,7 @@ class Rpc:
             verb=verb,
             gateway=gateway,
             request=_shown(payload, checked=error is None),
-            reply=None if reply is None else _shown(reply, checked=True),
+            reply=Raw(b"null") if reply is None else _shown(reply, checked=True),
             error=error,
             duration_ms=round((time.monotonic() - began) * 1e3, 3),
         )

@@ -371,7 +371,8 @@ class Session:
                 callback(key, alive)
 
         # What comes before `closer` is bound waits in the inbox: it is delivered by a later turn of the loop.
-        subscriber = self._raw.liveliness().declare_subscriber(expr, zenoh.handlers.Callback(take, indirect=False), history=True)
+        handler = zenoh.handlers.Callback(take, indirect=False)
+        subscriber = self._raw.liveliness().declare_subscriber(expr, handler, history=True)
         closer = Closer(subscriber.undeclare)
         return closer
 

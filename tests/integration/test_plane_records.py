@@ -1,0 +1,405 @@
+"""Replicated records on real sessions: compare-and-set, takeover, joining, repair, restart."""
+
+import asyncio
+import contextlib
+import os
+import random
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from appliance.errors import ConfigError, ConflictError, PayloadError, SwiftbotError, UnreachableError
+from appliance.plane.node import STORE_FILE, Plane
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.store import Store
+from appliance.plane.versions import Record, Write, descends
+
+pytestmark = pytest.mark.anyio
+
+
+async def _until(condition: Callable[[], object]) -> None:
+    """Wait until something is so; the test's own timeout bounds it."""
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
+class Fleet:
+    """Gateways in this process, each with its own endpoint and file; all are given only the first's endpoint."""
+
+    def __init__(self, folder: Path, ports: list[int], **settings: float) -> None:
+        self.folder = folder
+        self.endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
+        self.settings = settings
+        self.planes: dict[int, Plane] = {}
+
+    async def start(self, number: int) -> Plane:
+        """Start one gateway."""
+        connect = tuple(each for each in self.endpoints if each != self.endpoints[number])
+        config = msgspec.convert(
+            {"listen": (self.endpoints[number],), "connect": connect, **self.settings}, PlaneConfig
+        )
+        plane = await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=self.folder / f"g{number}")
+        self.planes[number] = plane
+        return plane
+
+    async def stop(self, number: int) -> None:
+        """Stop one gateway."""
+        await self.planes.pop(number).close()
+
+    async def settled(self) -> None:
+        """Wait until every gateway sees every other and has reconciled with them."""
+        await _until(
+            lambda: all(
+                len(plane.members()) == len(self.planes) and plane.dht._settled == plane.ring
+                for plane in self.planes.values()
+            )
+        )
+
+    def owned_by(self, number: int, prefix: str = "task") -> str:
+        """A new key that belongs to a gateway."""
+        ring = self.planes[number].ring
+        while True:
+            key = f"{prefix}/{random.randrange(10**9)}"  # noqa: S311 - any key will do
+            if ring.owner(key) == f"g{number}":
+                return key
+
+
+@pytest.fixture
+async def fleet(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncIterator[Fleet]:
+    """Three gateways that see each other."""
+    made = Fleet(tmp_path, free_ports(3))
+    for number in range(3):
+        await made.start(number)
+    await made.settled()
+    yield made
+    for number in list(made.planes):
+        await made.stop(number)
+
+
+@contextlib.asynccontextmanager
+async def _fleet_of(folder: Path, ports: list[int], **settings: float) -> AsyncIterator[Fleet]:
+    made = Fleet(folder, ports, **settings)
+    try:
+        yield made
+    finally:
+        for number in list(made.planes):
+            await made.stop(number)
+
+
+async def test_a_record_is_written_once_and_read_anywhere(fleet: Fleet) -> None:
+    """A write through any gateway is on every replica's disk when it returns; stale writers conflict."""
+    one, two, three = fleet.planes.values()
+    for owner in range(3):
+        key = fleet.owned_by(owner)
+        version = await one.dht.write(key, b"1", expected=None)
+        assert version == {f"g{owner}": 1}
+        for plane in fleet.planes.values():
+            assert (await plane.store.record(key)) is not None
+            read = await plane.dht.read(key)
+            assert read is not None
+            assert (read.value, read.version) == (b"1", version)
+            assert plane.dht.owns(key) == (plane.gateway == f"g{owner}")
+        newer = await two.dht.write(key, b"2", expected=version)
+        assert descends(newer, version)
+        for stale in (None, version, {"g9": 1}):
+            with pytest.raises(ConflictError):
+                await three.dht.write(key, b"3", expected=stale)
+        await three.dht.remove(key, expected=newer)
+        assert await one.dht.read(key) is None
+        assert key not in [record.key for record in await one.dht.local("task/")]
+        assert descends(await two.dht.write(key, b"4", expected=None), newer)
+    assert await one.dht.read("task/none") is None
+
+
+async def test_one_of_many_writers_at_many_gateways_wins(fleet: Fleet) -> None:
+    """Thirty writers at three gateways increment a counter by read and compare-and-set: none is lost or doubled."""
+    key = fleet.owned_by(1)
+    await fleet.planes[0].dht.write(key, b"0", expected=None)
+
+    async def add(plane: Plane) -> None:
+        while True:
+            record = await plane.dht.read(key)
+            assert record is not None
+            try:
+                await plane.dht.write(key, str(int(record.value) + 1).encode(), expected=record.version)
+            except ConflictError:
+                continue
+            return
+
+    await asyncio.gather(*(add(plane) for plane in fleet.planes.values() for _ in range(10)))
+    for plane in fleet.planes.values():
+        record = await plane.store.record(key)
+        assert record is not None
+        assert record.value == b"30"
+
+
+async def test_the_successor_takes_over(fleet: Fleet) -> None:
+    """When the owner leaves, another gateway owns its records, has them, and orders their writes."""
+    keys = [fleet.owned_by(2) for _ in range(20)]
+    versions = {key: await fleet.planes[0].dht.write(key, key.encode(), expected=None) for key in keys}
+    told: list[frozenset[str]] = []
+    lost: list[str] = []
+    fleet.planes[0].dht.on_ring_change.append(lambda: told.append(fleet.planes[0].members()))
+    fleet.planes[0].on_member_lost.append(lost.append)
+    await fleet.stop(2)
+    for key in keys:
+        version = await fleet.planes[1].dht.write(key, b"next", expected=versions[key])
+        assert descends(version, versions[key])
+        record = await fleet.planes[0].dht.read(key)
+        assert record is not None
+        assert record.value == b"next"
+    await _until(lambda: told == [frozenset({"g0", "g1"})])
+    assert lost == ["g2"]
+
+
+async def test_a_joiner_has_its_records_before_it_is_told(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """A gateway that joins has every record it now owns when its `on_ring_change` runs, and answers for them."""
+    async with _fleet_of(tmp_path, free_ports(2)) as fleet:
+        first = await fleet.start(0)
+        versions = {f"task/{n}": await first.dht.write(f"task/{n}", b"x" * n, expected=None) for n in range(200)}
+        await first.dht.remove("task/7", expected=versions.pop("task/7"))
+        joiner = await fleet.start(1)
+        had: list[int] = []
+
+        def told() -> None:
+            had.append(len(joiner.members()))
+
+        joiner.dht.on_ring_change.append(told)
+        await _until(lambda: had)
+        assert had[-1] == 2
+        assert {record.key: record.version for record in await joiner.dht.local("task/")} == versions
+        gone = await joiner.store.record("task/7")
+        assert gone is not None
+        assert gone.deleted
+        for key, version in versions.items():
+            await joiner.dht.write(key, b"", expected=version)
+
+
+async def test_nothing_is_lost_while_gateways_come_and_go(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """Four gateways with two replicas; each in turn is stopped and started under writes: no record is lost."""
+    async with _fleet_of(tmp_path, free_ports(4), replicas=2) as fleet:
+        for number in range(4):
+            await fleet.start(number)
+        await fleet.settled()
+        written: dict[str, int] = {}
+        stopping = asyncio.Event()
+
+        async def write() -> None:
+            while not stopping.is_set():
+                key = f"task/{random.randrange(60)}"  # noqa: S311 - any of sixty
+                plane = fleet.planes[0]
+                record = await plane.dht.read(key)
+                value = 1 if record is None else int(record.value) + 1
+                try:
+                    await plane.dht.write(key, str(value).encode(), expected=None if record is None else record.version)
+                except ConflictError:
+                    continue
+                written[key] = value
+                await asyncio.sleep(0.002)
+
+        writing = asyncio.create_task(write())
+        for number in (1, 2, 3):
+            await fleet.stop(number)
+            await fleet.settled()
+            await asyncio.sleep(0.1)
+            await fleet.start(number)
+            await fleet.settled()
+        stopping.set()
+        await writing
+        assert len(written) > 20
+        for key, value in written.items():
+            record = await fleet.planes[3].dht.read(key)
+            assert record is not None
+            assert int(record.value) == value
+        # Copies end up on the two replicas of each key, and nowhere else.
+        ring = fleet.planes[0].ring
+        for key in written:
+            while {n for n, plane in fleet.planes.items() if await plane.store.record(key)} != {
+                int(name[1:]) for name in ring.successors(key, 2)
+            }:
+                for plane in fleet.planes.values():
+                    plane._reconciler._changed.set()
+                await asyncio.sleep(0.02)
+
+
+async def test_a_restarted_gateway_has_its_shard(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """A lone gateway that is stopped and started has all its records and goes on counting their versions."""
+    async with _fleet_of(tmp_path, free_ports(1)) as fleet:
+        plane = await fleet.start(0)
+        version = await plane.dht.write("task/1", b"1", expected=None)
+        await plane.store.put("run/1", b"kept")
+        await fleet.stop(0)
+        plane = await fleet.start(0)
+        assert await plane.store.get("run/1") == b"kept"
+        assert await plane.dht.write("task/1", b"2", expected=version) == {"g0": 2}
+
+
+async def test_a_gateway_that_was_away_catches_up(fleet: Fleet) -> None:
+    """What was written, rewritten and removed while a gateway was away is so on its return."""
+    keys = [fleet.owned_by(2) for _ in range(30)]
+    versions = {key: await fleet.planes[0].dht.write(key, b"old", expected=None) for key in keys}
+    await fleet.stop(2)
+    await fleet.settled()
+    for key in keys[:10]:
+        versions[key] = await fleet.planes[1].dht.write(key, b"new", expected=versions[key])
+    for key in keys[10:20]:
+        await fleet.planes[1].dht.remove(key, expected=versions.pop(key))
+    back = await fleet.start(2)
+    await fleet.settled()
+    assert {record.key: record.version for record in await back.dht.local("task/")} == versions
+    assert (await back.dht.read(keys[0]) or Record(key="")).value == b"new"
+    assert await back.dht.read(keys[15]) is None
+
+
+async def test_a_damaged_file_is_filled_again_from_the_replicas(fleet: Fleet) -> None:
+    """A gateway whose file was destroyed starts with an empty one and gets its records back."""
+    keys = [fleet.owned_by(1) for _ in range(10)]
+    versions = {key: await fleet.planes[0].dht.write(key, b"v", expected=None) for key in keys}
+    await fleet.stop(1)
+    (fleet.folder / "g1" / STORE_FILE).write_bytes(b"not a database" * 100)
+    back = await fleet.start(1)
+    await fleet.settled()
+    assert back.store.set_aside is not None
+    assert {record.key: record.version for record in await back.dht.local("task/")} == versions
+
+
+def _least(key: str, one: Record, other: Record) -> Record:
+    return min(one, other, key=lambda record: record.value)
+
+
+async def test_versions_made_apart_are_resolved_alike(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """Gateways that wrote one key without knowing of each other agree on one version once they meet."""
+    ports = free_ports(2)
+    for number, value in ((0, b"aaa"), (1, b"bbb")):
+        async with _fleet_of(tmp_path, ports) as apart:
+            plane = await apart.start(number)
+            await plane.dht.write("task/1", value, expected=None)
+    async with _fleet_of(tmp_path, ports) as fleet:
+        for number in range(2):
+            plane = await fleet.start(number)
+            plane.dht.resolver = _least
+        await fleet.settled()
+        for plane in fleet.planes.values():
+            while (await plane.store.record("task/1") or Record(key="")).version != {"g0": 1, "g1": 1}:
+                await asyncio.sleep(0.01)
+        first, second = [await plane.store.record("task/1") for plane in fleet.planes.values()]
+        assert first == second
+
+
+async def test_a_missed_copy_is_repaired(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """A replica that lost or never got a copy has it again after the next comparison."""
+    async with _fleet_of(tmp_path, free_ports(2), anti_entropy_s=0.1) as fleet:
+        for number in range(2):
+            await fleet.start(number)
+        await fleet.settled()
+        await fleet.planes[0].dht.write("task/1", b"v", expected=None)
+        copy = await fleet.planes[1].store.record("task/1")
+        assert copy is not None
+        await fleet.planes[1].store.forget(copy)
+        while await fleet.planes[1].store.record("task/1") != copy:
+            await asyncio.sleep(0.02)
+
+
+async def test_an_owner_that_is_behind_catches_up_before_it_decides(fleet: Fleet) -> None:
+    """An owner that missed a version its writer has seen gets it from a replica instead of refusing."""
+    key = fleet.owned_by(0)
+    await fleet.planes[0].dht.write(key, b"1", expected=None)
+    for number in (1, 2):
+        await fleet.planes[number].dht.keep(Record(key=key, value=b"2", version={"g0": 1, "g1": 1}, write="w"))
+    version = await fleet.planes[2].dht.write(key, b"3", expected={"g0": 1, "g1": 1})
+    assert version == {"g0": 2, "g1": 1}
+
+
+async def test_a_second_owner_conflicts(fleet: Fleet) -> None:
+    """An owner whose replicas hold a version made by another owner conflicts, and all agree afterwards."""
+    key = fleet.owned_by(0)
+    for number in (1, 2):
+        await fleet.planes[number].dht.keep(Record(key=key, value=b"zzz", version={"g1": 1}, write="w"))
+    with pytest.raises(ConflictError, match="elsewhere"):
+        await fleet.planes[0].dht.write(key, b"aaa", expected=None)
+    copies = [await plane.store.record(key) for plane in fleet.planes.values()]
+    assert copies[0] is not None
+    assert copies[0].value == b"zzz"
+    assert copies[0].version == {"g0": 1, "g1": 1}
+    assert copies == [copies[0]] * 3
+
+
+async def test_bad_keys_and_values_are_refused(fleet: Fleet) -> None:
+    """Oversize values and impossible keys are refused with the reason, here and at the owner."""
+    plane = fleet.planes[0]
+    with pytest.raises(PayloadError, match="at most"):
+        await plane.dht.write("task/1", b"x" * (plane.config.max_record_bytes + 1), expected=None)
+    for key in ("", "a\nb", "x" * 600):
+        with pytest.raises(PayloadError):
+            await plane.dht.write(key, b"", expected=None)
+        with pytest.raises(PayloadError):
+            await plane.dht.read(key)
+    value = os.urandom(plane.config.max_record_bytes)
+    version = await plane.dht.write("task/large", value, expected=None)
+    record = await fleet.planes[1].dht.read("task/large")
+    assert record is not None
+    assert (record.value, record.version) == (value, version)
+
+
+async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
+    """Every verb the plane serves answers `payload` to what is malformed, oversize or impossible, and goes on."""
+    plane = fleet.planes[0]
+    foreign = await Session.open(PlaneConfig(mode="client", connect=(fleet.endpoints[0],)), "f")
+    verbs = sorted(plane.rpc._verbs)
+    assert verbs == ["dht_digest", "dht_fetch", "dht_read", "dht_store", "dht_write", "facts"]
+    impossible = {
+        "dht_read": [{"key": ""}],
+        "dht_write": [{"key": "", "value": ""}, {"key": "k", "expected": {"g": 0}}, {"key": "k", "value": "&"}],
+        "dht_store": [{"record": {"key": "k"}}, {"record": {"key": "k", "version": {"A/": 1}}}],
+        "dht_fetch": [{"keys": ["k"] * 5000}],
+        "dht_digest": [{"asker": "A/*"}],
+        "facts": [],
+    }
+    for verb in verbs:
+        key = plane.keys.rpc("g0", verb)
+        for payload in (b"", b"{", b"\xff\xff", b"[]", b"7", b"[" * 50_000):
+            with pytest.raises(PayloadError):
+                await foreign.query(key, payload, timeout_s=5)
+        for body in impossible[verb]:
+            with pytest.raises(PayloadError):
+                await foreign.query(key, msgspec.json.encode(body), timeout_s=5)
+        oversize = b"x" * (plane.config.max_payload_bytes + 1)
+        answers = await asyncio.to_thread(
+            lambda key=key, oversize=oversize: list(foreign._raw.get(key, payload=oversize, timeout=10))
+        )
+        assert b'"payload"' in answers[0].err.payload.to_bytes()
+        assert plane.session.refused[f"malformed gw/g0/rpc/{verb}"] >= 6
+        assert plane.session.refused[f"oversize gw/g0/rpc/{verb}"] == 1
+    await foreign.close()
+    key = fleet.owned_by(0)
+    assert await fleet.planes[1].dht.write(key, b"still works", expected=None)
+
+
+async def test_a_write_meant_for_another_is_refused(fleet: Fleet) -> None:
+    """A gateway that does not own a key does not order its writes: it names the owner."""
+    key = fleet.owned_by(1)
+    with pytest.raises(SwiftbotError, match="belongs to g1"):
+        await fleet.planes[0].dht._on_write(Write(key=key, value=b"", write="w"))
+
+
+async def test_an_id_that_is_taken_is_refused(fleet: Fleet) -> None:
+    """A second gateway with the id of one that is there is refused, and disturbs nothing."""
+    config = PlaneConfig(connect=(fleet.endpoints[0],), lease_ms=200)
+    with pytest.raises(ConfigError, match="named g1 is already"):
+        await Plane.open(config, fleet="f", gateway="g1", data_dir=fleet.folder / "second")
+    assert fleet.planes[0].members() == {"g0", "g1", "g2"}
+    store = await Store.open(fleet.folder / "second" / STORE_FILE)
+    await store.close()
+
+
+async def test_a_fleet_that_cannot_be_written_to_says_so(fleet: Fleet) -> None:
+    """When the owner answers nothing but errors of its own mind, the write ends within its time with the reason."""
+    plane = fleet.planes[0]
+    key = fleet.owned_by(1)
+    plane.dht._config = msgspec.structs.replace(plane.config, write_timeout_s=0.2)
+    fleet.planes[1].rpc.close()
+    with pytest.raises(UnreachableError, match="could not be written"):
+        await plane.dht.write(key, b"", expected=None)

@@ -1,0 +1,334 @@
+"""Session and RPC between real Zenoh sessions on loopback: delivery, errors, and every kind of bad input."""
+
+import asyncio
+import itertools
+import json
+import socket
+from collections.abc import AsyncIterator, Callable
+
+import msgspec
+import pytest
+
+from appliance.errors import (
+    ConfigError,
+    DeadlineError,
+    PayloadError,
+    PlanError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+)
+from appliance.model import ErrorReply, LogLine, Need, encode
+from appliance.plane.rpc import Exchange, Rpc
+from appliance.plane.session import Message, Session
+from appliance.plane.settings import PlaneConfig
+
+pytestmark = pytest.mark.anyio
+
+LIMIT = 2 * 2**20
+
+
+async def _until(condition: Callable[[], object]) -> None:
+    """Wait until something is so; the test's own timeout bounds it."""
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+async def pair(free_port: int) -> AsyncIterator[tuple[Session, Session]]:
+    """Two linked peers."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    limits = {"max_payload_bytes": LIMIT, "max_record_bytes": 2**20}
+    one = await Session.open(PlaneConfig(listen=(endpoint,), **limits), "f")
+    other = await Session.open(PlaneConfig(connect=(endpoint,), **limits), "f")
+    await _until(lambda: one.linked and other.linked)
+    yield one, other
+    await one.close()
+    await other.close()
+
+
+async def _heard(speaker: Session, listener: Session) -> None:
+    """Wait until the speaker's puts reach the listener's subscriptions."""
+    heard = asyncio.Event()
+    closer = listener.subscribe("swiftbot/f/probe", lambda _: heard.set())
+    while not heard.is_set():
+        speaker.put("swiftbot/f/probe", b"")
+        await asyncio.sleep(0.01)
+    closer.close()
+
+
+async def test_facts_arrive_in_order_on_the_loop(pair: tuple[Session, Session]) -> None:
+    """Puts and a delete arrive complete, in order, with the sender's clock and encoding, on the loop's thread."""
+    one, other = pair
+    seen: list[Message] = []
+    closer = other.subscribe("swiftbot/f/x/*", seen.append)
+    await _heard(one, other)
+    for n in range(500):
+        one.put("swiftbot/f/x/a", str(n).encode(), encoding="text/plain")
+    one.delete("swiftbot/f/x/a")
+    await _until(lambda: len(seen) == 501)
+    assert [message.payload for message in seen[:-1]] == [str(n).encode() for n in range(500)]
+    assert seen[-1].deleted
+    assert not seen[0].deleted
+    assert seen[0].encoding == "text/plain"
+    assert all(first.at_ns < later.at_ns for first, later in itertools.pairwise(seen))
+    closer.close()
+    closer.close()
+    one.put("swiftbot/f/x/a", b"late")
+    await _heard(one, other)
+    assert len(seen) == 501
+
+
+async def test_bad_facts_are_counted_and_dropped(pair: tuple[Session, Session]) -> None:
+    """Malformed, mistyped, empty, deeply nested and oversize payloads are counted; good ones before and after count."""
+    one, other = pair
+    seen: list[tuple[str, LogLine | None]] = []
+    other.subscribe_typed(other.keys.log(), LogLine, lambda key, value: seen.append((key, value)))
+    await _heard(one, other)
+    good = encode(LogLine(at_ns=1, level="info", source="s", event="e"))
+    key = one.keys.log("g")
+    bad = [b"", b"{", b"\xff\xfe", b"[]", b'{"at_ns": "x"}', b"null", b"[" * 100_000]
+    for payload in (good, *bad, good):
+        one.put(key, payload)
+    one._raw.put(key, b"x" * (LIMIT + 1))  # a foreign client keeps to no limit
+    one.delete(key)
+    await _until(lambda: len(seen) == 3)
+    assert [value is None for _, value in seen] == [False, False, True]
+    assert other.refused == {"malformed gw/*/log": len(bad), "oversize gw/*/log": 1}
+
+
+async def test_an_oversize_put_is_refused_here(pair: tuple[Session, Session]) -> None:
+    """A put larger than the limit is counted and not sent; a request raises."""
+    one, _ = pair
+    one.put("swiftbot/f/x", b"x" * (LIMIT + 1))
+    assert one.refused == {"oversize put": 1}
+    with pytest.raises(PayloadError, match="at most"):
+        await one.query("swiftbot/f/x", b"x" * (LIMIT + 1), timeout_s=1)
+
+
+async def test_requests_and_their_errors(pair: tuple[Session, Session]) -> None:
+    """A verb answers; each error comes back as the class that was raised, a defect as `internal`."""
+    one, other = pair
+    caller, server = Rpc(one, "a"), Rpc(other, "b")
+
+    async def handle(need: Need) -> Need:
+        if need.image == "refuse":
+            raise RefusedError("no", remedy="later")
+        if need.image == "plan":
+            raise PlanError("none", problems=("p1", "p2"))
+        if need.image == "defect":
+            raise ZeroDivisionError("oh")
+        if need.image == "slow":
+            await asyncio.sleep(30)
+        return need
+
+    server.register("need", Need, handle)
+    while True:  # until the queryable is known over there
+        try:
+            assert await caller.call("b", "need", Need(image="x"), Need) == Need(image="x")
+            break
+        except UnreachableError:
+            await asyncio.sleep(0.01)
+    with pytest.raises(RefusedError, match=r"no \(later\)"):
+        await caller.call("b", "need", Need(image="refuse"), Need)
+    with pytest.raises(PlanError) as caught:
+        await caller.call("b", "need", Need(image="plan"), Need)
+    assert caught.value.problems == ("p1", "p2")
+    with pytest.raises(SwiftbotError, match="ZeroDivisionError: oh") as defect:
+        await caller.call("b", "need", Need(image="defect"), Need)
+    assert defect.value.code == "internal"
+    with pytest.raises(DeadlineError):
+        await caller.call("b", "need", Need(image="slow"), Need, timeout_s=0.1)
+    with pytest.raises(UnreachableError):
+        await caller.call("b", "nothing", Need(image="x"), Need)
+    with pytest.raises(PayloadError, match="no ErrorReply"):
+        await caller.call("b", "need", Need(image="x"), ErrorReply)
+    with pytest.raises(ConfigError):
+        server.register("need", Need, handle)
+
+
+async def test_bad_requests_are_answered_with_the_reason(pair: tuple[Session, Session]) -> None:
+    """Malformed and oversize requests get an ErrorReply of code `payload`, are counted, and reach no handler."""
+    one, other = pair
+    server = Rpc(other, "b")
+    reached: list[Need] = []
+
+    async def handle(need: Need) -> Need:
+        reached.append(need)
+        return need
+
+    server.register("need", Need, handle)
+    key = one.keys.rpc("b", "need")
+    await _heard(one, other)
+    bad = [b"", b"{", b"\xff", b"[]", b'{"image": 5}', b"[" * 100_000]
+    for payload in bad:
+        with pytest.raises(PayloadError, match="not a Need"):
+            await one.query(key, payload, timeout_s=5)
+    foreign = await asyncio.to_thread(lambda: list(one._raw.get(key, payload=b"x" * (LIMIT + 1), timeout=5)))
+    assert len(foreign) == 1
+    assert foreign[0].err is not None
+    assert msgspec.json.decode(foreign[0].err.payload.to_bytes(), type=ErrorReply).code == "payload"
+    assert reached == []
+    assert other.refused == {"malformed gw/b/rpc/need": len(bad), "oversize gw/b/rpc/need": 1}
+    assert await one.query(key, b'{"image": "x"}', timeout_s=5) == b'{"image":"x"}'
+
+
+async def test_exchanges_can_be_watched(pair: tuple[Session, Session]) -> None:
+    """Each exchange is put: request and reply as JSON, what is too large by digest, errors by code."""
+    one, other = pair
+    seen: list[Exchange | None] = []
+    one.subscribe_typed(one.keys.exchange(), Exchange, lambda _, exchange: seen.append(exchange))
+    server = Rpc(other, "b")
+
+    async def handle(need: Need) -> Need:
+        return Need(image="y" * 40_000) if need.image == "large" else need
+
+    async def quiet(need: Need) -> Need:
+        return need
+
+    server.register("need", Need, handle)
+    server.register("quiet", Need, quiet, exchange=False)
+    await _heard(other, one)
+    await _heard(one, other)
+    caller = Rpc(one, "a")
+    await caller.call("b", "quiet", Need(image="x"), Need)
+    await caller.call("b", "need", Need(image="x"), Need)
+    await caller.call("b", "need", Need(image="large"), Need)
+    with pytest.raises(PayloadError):
+        await one.query(one.keys.rpc("b", "need"), b"\xff{", timeout_s=5)
+    await _until(lambda: len(seen) == 3)
+    small, large, malformed = (json.loads(encode(each)) for each in seen)
+    assert (small["verb"], small["gateway"], small["request"], small["reply"]) == (
+        "need", "b", {"image": "x"}, {"image": "x"},
+    )  # fmt: skip
+    assert small["duration_ms"] >= 0
+    assert large["reply"]["bytes"] > 40_000
+    assert len(large["reply"]["sha256"]) == 64
+    assert malformed["error"]["code"] == "payload"
+    assert isinstance(malformed["request"], str)
+
+
+async def test_too_many_queries_at_once_are_refused(free_port: int) -> None:
+    """Beyond `concurrent_queries` a query is answered `refused` at once; the others are answered."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    server = await Session.open(PlaneConfig(listen=(endpoint,), concurrent_queries=2), "f")
+    client = await Session.open(PlaneConfig(mode="client", connect=(endpoint,)), "f")
+    go = asyncio.Event()
+
+    async def handle(key: str, payload: bytes) -> bytes:
+        await go.wait()
+        return payload
+
+    server.serve("swiftbot/f/q", handle)
+    await _heard(client, server)
+    asked = [asyncio.create_task(client.query("swiftbot/f/q", b"x", timeout_s=20)) for _ in range(5)]
+    await _until(lambda: sum(each.done() for each in asked) == 3)
+    go.set()
+    results = await asyncio.gather(*asked, return_exceptions=True)
+    assert sum(isinstance(each, RefusedError) for each in results) == 3
+    assert sum(each == b"x" for each in results) == 2
+    await client.close()
+    await server.close()
+
+
+async def test_closing_ends_what_is_under_way(free_port: int) -> None:
+    """When the answering side closes, its caller hears at once; when the asking side closes, its own wait ends."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    server = await Session.open(PlaneConfig(listen=(endpoint,)), "f")
+    client = await Session.open(PlaneConfig(mode="client", connect=(endpoint,)), "f")
+    begun = asyncio.Event()
+
+    async def handle(key: str, payload: bytes) -> bytes:
+        begun.set()
+        await asyncio.Event().wait()
+        return b""
+
+    server.serve("swiftbot/f/q", handle)
+    await _heard(client, server)
+    first = asyncio.create_task(client.query("swiftbot/f/q", b"", timeout_s=60))
+    await begun.wait()
+    await server.close()
+    await server.close()
+    with pytest.raises(UnreachableError):
+        await first
+    waiting = asyncio.create_task(client.query("swiftbot/f/q", b"", timeout_s=60))
+    await asyncio.sleep(0)
+    await client.close()
+    with pytest.raises(UnreachableError):
+        await waiting
+    with pytest.raises(UnreachableError):
+        await client.query("swiftbot/f/q", b"", timeout_s=1)
+
+
+async def test_everybody_is_asked(pair: tuple[Session, Session]) -> None:
+    """`query_all` returns each answer with its key, and leaves errors out."""
+    one, other = pair
+
+    async def good(key: str, payload: bytes) -> bytes:
+        return payload + b"!"
+
+    async def bad(key: str, payload: bytes) -> bytes:
+        raise RefusedError("no")
+
+    one.serve("swiftbot/f/all/one", good)
+    other.serve("swiftbot/f/all/two", good)
+    other.serve("swiftbot/f/all/three", bad)
+    await _heard(one, other)
+    answers = await one.query_all("swiftbot/f/all/*", b"hi", timeout_s=5)
+    assert {(each.key, each.payload) for each in answers} == {
+        ("swiftbot/f/all/one", b"hi!"), ("swiftbot/f/all/two", b"hi!"),
+    }  # fmt: skip
+
+
+async def test_tokens_are_seen_by_those_who_come_later(pair: tuple[Session, Session]) -> None:
+    """A token is seen with history, listed on demand, and its end is told."""
+    one, other = pair
+    token = one.declare_alive(one.keys.alive("a"))
+    seen: list[tuple[str, bool]] = []
+    key = one.keys.alive("a")
+    while await other.alive_now(other.keys.alive()) != [key]:
+        await asyncio.sleep(0.01)
+    other.watch_alive(other.keys.alive(), lambda each, alive: seen.append((each, alive)))
+    await _until(lambda: seen == [(key, True)])
+    token.close()
+    await _until(lambda: seen == [(key, True), (key, False)])
+
+
+async def test_a_port_in_use_is_named(free_port: int) -> None:
+    """Listening on a port in use is a ConfigError that names the endpoint and what to do."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", free_port))
+        holder.listen()
+        with pytest.raises(ConfigError, match=f"{endpoint}.*in use") as caught:
+            await Session.open(PlaneConfig(listen=(endpoint,)), "f")
+    assert "plane.listen" in caught.value.remedy
+
+
+async def test_an_address_of_another_machine_is_named() -> None:
+    """Listening on an address that is not ours is a ConfigError that names it."""
+    with pytest.raises(ConfigError, match="no such address"):
+        await Session.open(PlaneConfig(listen=("tcp/192.0.2.1:7447",)), "f")
+
+
+async def test_a_client_without_gateway_says_so(free_port: int) -> None:
+    """A client whose endpoints do not answer gets an UnreachableError that names them."""
+    config = PlaneConfig(mode="client", connect=(f"tcp/127.0.0.1:{free_port}",), connect_timeout_s=0.2)
+    with pytest.raises(UnreachableError, match=str(free_port)):
+        await Session.open(config, "f")
+
+
+async def test_a_client_comes_back_to_a_restarted_gateway(free_port: int) -> None:
+    """A client outlives its gateway: when one listens there again, it is linked again by itself."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    server = await Session.open(PlaneConfig(listen=(endpoint,)), "f")
+    client = await Session.open(PlaneConfig(mode="client", connect=(endpoint,)), "f")
+    seen: list[Message] = []
+    client.subscribe("swiftbot/f/x", seen.append)
+    await server.close()
+    server = await Session.open(PlaneConfig(listen=(endpoint,)), "f")
+    while not seen:
+        server.put("swiftbot/f/x", b"back")
+        await asyncio.sleep(0.02)
+    await client.close()
+    await server.close()
