@@ -10,6 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Found examples are printed, not kept: no run depends on an earlier one, and the tree may be read-only.
+settings.register_profile("alone", database=None)
+settings.load_profile("alone")
 
 ROOT = Path(__file__).resolve().parent.parent
 """The project's root folder."""

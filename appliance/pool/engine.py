@@ -15,6 +15,7 @@ it makes in its bind-mounted folder belong to the service user (rootless: root i
 import asyncio
 import json
 import os
+import socket
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,7 @@ from podman.errors import APIError, ImageNotFound, PodmanError
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 
 T = TypeVar("T")
+BUILD_REMEDY = "swiftbot images build"
 RUNC_REMEDY = (
     'crun wants cgroup v2: put runtime = "runc" under [engine] in ~/.config/containers/containers.conf of the'
     " service user and restart podman.socket"
@@ -180,20 +182,30 @@ class PodmanEngine:
     async def _ask(self, what: str, work: Callable[[Any], T]) -> T:
         def call() -> T:
             try:
+                self._knock()
                 return work(self._client())
             except ImageNotFound as error:
-                raise PrerequisiteError(f"{what}: the image is not there", remedy="swiftbot images build") from error
+                raise PrerequisiteError(f"{what}: the image is not there", remedy=BUILD_REMEDY) from error
             except APIError as error:
                 # podman-py raises this for a socket it cannot connect to as well, then without a response.
                 if error.response is None:
                     raise self._unreachable(error) from error
-                raise PoolError(f"{what}: {error.explanation or error}") from error
+                text = str(error.explanation or error)
+                if "image not known" in text:  # Podman 4.3 says so with another status than 404
+                    raise PrerequisiteError(f"{what}: the image is not there", remedy=BUILD_REMEDY) from error
+                raise PoolError(f"{what}: {text}") from error
             except (requests.RequestException, OSError) as error:
                 raise self._unreachable(error) from error
             except (PodmanError, ValueError, KeyError) as error:
                 raise PoolError(f"{what}: {error}") from error
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, call)
+
+    def _knock(self) -> None:
+        """Connect and hang up; OSError when nobody listens. podman-py leaks a socket each time it finds that out."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as knock:
+            knock.settimeout(self._timeout_s)
+            knock.connect(str(self.path))
 
     def _unreachable(self, error: Exception) -> UnreachableError:
         why = "is not there" if not self.path.exists() else f"does not answer ({type(error).__name__})"

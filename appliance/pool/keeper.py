@@ -130,25 +130,35 @@ class Keeper:
         self._stopped = True
         for waiter in self._waiting:
             waiter.got.cancel()
-        ended = [task for task in (self._tender, self._connecting, *self._starts.values()) if task is not None]
-        for task in ended:
-            task.cancel()
-        tasks: list[asyncio.Task[Any]] = [*ended, *self._background]
-        if tasks:
-            _, late = await asyncio.wait(tasks, timeout=patience_s)
-            for task in late:
+        for task in (self._tender, self._connecting):
+            if task is not None:
                 task.cancel()
+        # Starts are let come to their end: one cut off between two steps would leave a container nobody knows.
+        until = time.monotonic() + patience_s
+        while tasks := self._unfinished():
+            left_s = until - time.monotonic()
+            await asyncio.wait(tasks, timeout=max(0.0, left_s), return_when=asyncio.FIRST_COMPLETED)
+            if left_s <= 0:
+                for task in tasks:
+                    task.cancel()
+                await asyncio.wait(tasks, timeout=1.0)
+                break
         for container in self._pooled.values():
             container.close()
         if not keep_containers and self._engine is not None:
-            removals = (self._starter.remove(each, self._engine) for each in self._pooled.values())
-            for result in await asyncio.gather(*removals, return_exceptions=True):
-                if isinstance(result, BaseException):
-                    log.warning("container was left", reason=str(result))
+            try:
+                await asyncio.gather(*(self._starter.remove(each, self._engine) for each in self._pooled.values()))
+                await asyncio.gather(*(self._engine.remove(each) for each in await self._starter.own(self._engine)))
+            except SwiftbotError as error:
+                log.warning("containers were left", reason=str(error))
         self._pooled.clear()
         if self._engine is not None:
             await asyncio.to_thread(self._engine.close)
             self._engine = None
+
+    def _unfinished(self) -> list[asyncio.Task[Any]]:
+        own = [task for task in (self._tender, self._connecting) if task is not None and not task.done()]
+        return [*own, *self._starts.values(), *self._background]
 
     # --- handing out ------------------------------------------------------------------------------------------
 

@@ -66,6 +66,7 @@ def run(ctx):
         time.sleep(60)
     if do == "clean up":
         try:
+            ctx.progress(0.1)
             time.sleep(60)
         except ctx.Cancelled:
             ctx.log("cleaned")
@@ -234,8 +235,8 @@ class FakeEngine:
             await process.wait()
 
     async def logs(self, container: str) -> str:
-        """Say nothing."""
-        return ""
+        """Say only whose logs these would be."""
+        return f"logs of {container}"
 
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return those with the labels."""
@@ -300,8 +301,8 @@ class Bench:
                 return {"number": call.number}
 
     async def find_remote(self, need: Need) -> list[Candidate]:
-        """Offer what the test has put there."""
-        return self.offers
+        """Offer what the test has put there for this image."""
+        return [each for each in self.offers if each.container.image == need.image]
 
     async def pool(self, *, gateway: str = "g1", fleet: str = "f1", **settings: Any) -> Pool:
         """Return a started pool."""
@@ -379,7 +380,8 @@ async def zygote(short_dir: Path, skills_dir: Path) -> AsyncIterator[Callable[[]
     spec = {"skills": {name: str(skills_dir / name) for name in ("probe", "broken")}, "modules": ["json", "nowhere"]}
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "runner.main", "--socket", "runner.sock", "--spec", json.dumps(spec),
-        "--scratch", str(short_dir), cwd=folder, env={"PYTHONPATH": str(RUNNER.parent), "PYTHONDONTWRITEBYTECODE": "1", "PATH": os.environ["PATH"]},
+        "--scratch", str(short_dir), cwd=folder,
+        env={"PYTHONPATH": str(RUNNER.parent), "PYTHONDONTWRITEBYTECODE": "1", "PATH": os.environ["PATH"]},
     )  # fmt: skip
     await until((folder / "runner.sock").exists, "the runner's socket")
     opened: list[Connection] = []

@@ -65,8 +65,10 @@ def test_one_line_sources() -> None:
     """The same of a one-line-style file."""
     assert sources.from_list(ONE_LINE, "bookworm") == [
         "deb http://one.example/debian bookworm main",
-        "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]"
-        " http://s.example/security bookworm-security main",
+        (
+            "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]"
+            " http://s.example/security bookworm-security main"
+        ),
     ]
 
 
@@ -122,7 +124,8 @@ def test_socket_path(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_containers_are_hardened() -> None:
     """A container is asked for read-only, without capabilities, privileges or network; limits where they hold."""
     spec = ContainerSpec(
-        name="c", image="i", command=("true",), labels={"a": "b"}, binds={"/host/run": "/run/swiftbot", "/s": "/skills"},
+        name="c", image="i", command=("true",), labels={"a": "b"},
+        binds={"/host/run": "/run/swiftbot", "/s": "/skills"},
         writable=frozenset({"/host/run"}), volumes={"v": "/volumes/v"}, environment={}, cpu=0.5, memory_mb=64,
         pids=32, tmp_mb=8, limits=True,
     )  # fmt: skip

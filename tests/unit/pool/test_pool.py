@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ async def test_cold_then_warm(bench: Any) -> None:
     assert (second.kind, second.phase) == (RunEventKind.SUCCEEDED, Phase.LOCAL_WARM)
     assert second.container == first.container
     assert second.result["site"] == "yard"
-    assert [event.kind for event in events][0] is RunEventKind.STARTED
+    assert next(event.kind for event in events) is RunEventKind.STARTED
     assert {event.kind for event in events} == {
         RunEventKind.STARTED, RunEventKind.PROGRESS, RunEventKind.LOG, RunEventKind.PARTIAL,
     }  # fmt: skip
@@ -356,7 +355,7 @@ async def test_adoption_after_a_kill_in_mid_run(bench: Any, tmp_path: Path) -> N
     await before.stop(keep_containers=True)
     after = await bench.pool()
     assert [each.state for each in after.containers()] == [ContainerState.READY]
-    assert not os.path.exists(f"/proc/{pid}")
+    assert not Path(f"/proc/{pid}").exists()
 
 
 async def test_what_cannot_be_adopted_is_removed(bench: Any) -> None:

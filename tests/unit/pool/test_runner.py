@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -49,6 +48,15 @@ async def _wait_gone(pid: int) -> None:
     async with asyncio.timeout(10):
         while not _gone(pid):
             await asyncio.sleep(0.005)
+
+
+async def _wait_free(zygote: Zygote) -> None:
+    control = await zygote()
+    async with asyncio.timeout(10):
+        while True:
+            await control.send({"op": "ping"})
+            if not (await control.receive())["run"]:
+                return
 
 
 async def test_frames_of_a_run(zygote: Zygote) -> None:
@@ -127,6 +135,7 @@ async def test_cancel_lets_the_handler_clean_up(zygote: Zygote) -> None:
     connection, control = await zygote(), await zygote()
     await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": {"do": "clean up"}})
     assert (await connection.receive())["ev"] == "started"
+    assert (await connection.receive())["ev"] == "progress"
     await control.send({"op": "cancel", "run": "other"})
     assert await control.receive() == {"ok": False}
     await control.send({"op": "cancel", "run": "r1"})
@@ -165,6 +174,7 @@ async def test_hang_up_ends_the_child(zygote: Zygote, tmp_path: Path) -> None:
         pid = int(await _wait_for(file))
         connection.close()
         await _wait_gone(pid)
+        await _wait_free(zygote)
     assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
 
 
@@ -272,4 +282,4 @@ def test_environment_is_clean() -> None:
     folder = Path(__file__).resolve().parents[3] / "appliance" / "pool" / "runner"
     text = "".join(file.read_text() for file in folder.glob("*.py"))
     assert "appliance." not in text.replace("the appliance.", "")
-    assert os.path.exists(folder / "main.py")
+    assert (folder / "main.py").exists()

@@ -75,11 +75,11 @@ def test_phases_in_order(need: Need, local: list[ContainerInfo], remote: list[Ca
     """Local if any local container will do, else remote within theta and gamma, else cold."""
     config = PoolConfig()
     decision = select(need, local, remote, cold_ms, config, gateway="g1")
-    fit = {
-        c.id: value
+    fit = [
+        (value, c.id)
         for c in local
         if c.state is ContainerState.READY and (value := score(c, need, config.weights)) is not None
-    }
+    ]
     far = [
         (value, c)
         for c in remote
@@ -90,12 +90,7 @@ def test_phases_in_order(need: Need, local: list[ContainerInfo], remote: list[Ca
     ]
     if fit:
         assert decision.phase is Phase.LOCAL_WARM
-        assert decision.container in fit
-        assert decision.score == max(
-            value
-            for c in local
-            if c.state is ContainerState.READY and (value := score(c, need, config.weights)) is not None
-        )
+        assert (decision.score, decision.container) == max(fit)
     elif far:
         assert (decision.phase, decision.gateway) == (Phase.REMOTE_WARM, "g2")
         assert decision.score == max(value for value, _ in far)
