@@ -131,20 +131,13 @@ class Slot:
 
     def _feed(self, prompt: list[int], grammar: str) -> int:
         """Compute the prompt, reusing what the last one shares with it; return how many tokens that was."""
-        generator: Any = self._generator
         common = 0
-        if generator is not None and self._key == grammar:
+        if self._generator is not None and self._key == grammar:
             shared = min(len(prompt) - 1, len(self._seen))
             while common < shared and prompt[common] == self._seen[common]:
                 common += 1
         try:
-            if common:
-                generator.rewind_to(common)
-            else:
-                params = self._og.GeneratorParams(self._model)
-                params.set_search_options(max_length=self._limit, do_sample=False)
-                params.set_guidance("lark_grammar", grammar, False)
-                generator = self._og.Generator(self._model, params)
+            generator = self._rewound(common) if common else self._fresh(grammar)
             generator.append_tokens(prompt[common:])
         except Exception as error:
             self._generator = None
@@ -152,6 +145,16 @@ class Slot:
         self._generator, self._key = generator, grammar
         self._seen = list(prompt)
         return common
+
+    def _rewound(self, tokens: int) -> Any:
+        self._generator.rewind_to(tokens)
+        return self._generator
+
+    def _fresh(self, grammar: str) -> Any:
+        params = self._og.GeneratorParams(self._model)
+        params.set_search_options(max_length=self._limit, do_sample=False)
+        params.set_guidance("lark_grammar", grammar, False)
+        return self._og.Generator(self._model, params)
 
     def _generate(self, choices: dict[str, Any], deadline: float) -> tuple[str, float]:
         stream = self._tokenizer.create_stream()

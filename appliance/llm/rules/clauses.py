@@ -182,8 +182,8 @@ class Reader:
         words = len(text.split())
         if not text or words > 60:
             return None
-        core = _LEADING.sub("", text) if _LEADING.match(text) else text
-        for _ in range(3):
+        core = text
+        for _ in range(4):
             if (match := _LEADING.match(core)) and match.end():
                 core = core[match.end() :]
         if match := self._with.search(core):
@@ -302,7 +302,7 @@ class Reader:
     ) -> tuple[list[Step], str, float, dict[str, Any]] | None:
         rest = re.sub(
             (
-                r"\s+(?:please|now|immediately|right away|straight away|too|as well|again|once|at the "
+                r"(?:^|\s+)(?:please|now|immediately|right away|straight away|too|as well|again|once|at the "
                 r"same time|simultaneously|in parallel|in that order|meanwhile)$"
             ),
             "",

@@ -10,7 +10,9 @@ from typing import Any
 
 from msgspec import Struct, field
 
+from appliance.errors import PlanError
 from appliance.llm.rules.phrases import Step
+from appliance.llm.validate import MAX_SUBTASKS
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
 
@@ -181,6 +183,8 @@ class Graph:
         return found
 
     def _node(self, step: Step, robot: str | None, after: Iterable[int]) -> int:
+        if len(self.steps) >= MAX_SUBTASKS:
+            raise PlanError(f"the instruction asks for more than {MAX_SUBTASKS} subtasks", remedy="give it in parts")
         self.steps.append(
             (step.skill, robot, {key: value for key, value in step.params.items() if not key.startswith("_")})
         )

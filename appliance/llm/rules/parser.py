@@ -368,7 +368,10 @@ class Parser:
         if re.match(r"(?:that|those) (?:of|from) ", rest) and (quantity := previous.steps[-1].params.get("quantity")):
             rest = f"{quantity} {rest.split(None, 1)[1]}"
         prefix = previous.prefix
-        for candidate in (prefix, prefix.rsplit(" ", 1)[0]):
+        # "drone_1 flies to mast 1 and drone_2 to mast 2": the preposition is said again.
+        shorter = prefix.rsplit(" ", 1)[0]
+        again = rest.split(None, 1)[0].lower() == prefix.rsplit(" ", 1)[-1].lower()
+        for candidate in (shorter, prefix) if again else (prefix, shorter):
             clause = self._reader.read(f"{candidate} {rest}", speaking_to=found[0])
             if clause and [step.skill for step in clause.steps] == [step.skill for step in previous.steps]:
                 clause.who = Who(found[0], "named")

@@ -1,5 +1,7 @@
 """The tier that is always there: pure parsing, no model, no network, milliseconds."""
 
+import asyncio
+
 from appliance.errors import PlanError
 from appliance.llm.rules.domains import domain_of
 from appliance.llm.rules.parser import Parser, Reading
@@ -16,7 +18,7 @@ def read(context: PlanContext, catalogue: Catalogue) -> tuple[Plan, Reading]:
     """Parse an instruction; pure. The plan may be empty or not valid: the caller decides.
 
     Raises:
-        PlanError: the instruction is empty or too long.
+        PlanError: the instruction is empty or too long, or asks for too much at once.
     """
     text = context.instruction.strip()
     if not text:
@@ -47,7 +49,8 @@ class RulesTier:
     ) -> Proposal:
         """Parse; PlanError names what was not understood when nothing was."""
         del previous, problems
-        plan, reading = read(context, self._catalogue)
+        # In a thread: a long text takes a quarter of a second, and the loop has leases to keep.
+        plan, reading = await asyncio.to_thread(read, context, self._catalogue)
         lost = tuple(f"not understood: {piece!r}" for piece in reading.lost)
         if not plan.subtasks:
             raise PlanError(
