@@ -71,9 +71,10 @@ def render(world: World, pose: Pose, view: Aim, *, robot: str, width: int = WIDT
     eye = np.array([pose.x, pose.y, EYE_M], dtype=np.float32)
     rays = _rays(view, width, height)
     picture = _ground(world, eye, rays)
+    inverse: list[Floats] = [np.ascontiguousarray(1.0 / rays[..., axis]) for axis in range(3)]
     depth = np.full(rays.shape[:2], _FAR_M, dtype=np.float32)
     for solid in _solids(world, pose, robot):
-        _draw(solid, eye, rays, picture, depth)
+        _draw(solid, eye, inverse, picture, depth)
     return Image.fromarray(picture)
 
 
@@ -136,15 +137,22 @@ def _solids(world: World, pose: Pose, robot: str) -> list[_Solid]:
     return solids
 
 
-def _draw(solid: _Solid, eye: Floats, rays: Floats, picture: Pixels, depth: Floats) -> None:
-    """Paint a box where it is nearer than what is there."""
-    one = (np.array(solid.low, dtype=np.float32) - eye) / rays
-    other = (np.array(solid.high, dtype=np.float32) - eye) / rays
-    enters = np.minimum(one, other)
-    leaves = np.maximum(one, other).min(axis=2)
-    face = enters.argmax(axis=2)
-    near = enters.max(axis=2)
-    hit = (near < leaves) & (near > 0.05) & (near < depth)
+def _draw(solid: _Solid, eye: Floats, inverse: list[Floats], picture: Pixels, depth: Floats) -> None:
+    """Paint a box where it is nearer than what is there; `inverse` holds one over each ray's x, y and z."""
+    near = far = face = None
+    for axis, slope in enumerate(inverse):
+        one = (solid.low[axis] - float(eye[axis])) * slope
+        other = (solid.high[axis] - float(eye[axis])) * slope
+        enters, leaves = np.minimum(one, other), np.maximum(one, other)
+        if near is None or far is None or face is None:
+            near, far, face = enters, leaves, np.zeros(enters.shape, dtype=np.uint8)
+            continue
+        later = enters > near
+        face[later] = axis
+        near, far = np.maximum(near, enters), np.minimum(far, leaves)
+    if near is None or far is None or face is None:
+        return
+    hit = (near < far) & (near > 0.05) & (near < depth)
     if not hit.any():
         return
     shades = np.array(_SHADES, dtype=np.float32)[face[hit]][:, None]
