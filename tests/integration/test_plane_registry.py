@@ -1,0 +1,181 @@
+"""The registry on real sessions: facts spread, reach latecomers, and go with their owner."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.errors import UnreachableError
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
+from appliance.plane.node import Plane, PlaneClient
+from appliance.plane.session import Message, Session
+from appliance.plane.settings import PlaneConfig
+
+pytestmark = pytest.mark.anyio
+
+
+async def _until(condition: Callable[[], object]) -> None:
+    """Wait until something is so; the test's own timeout bounds it."""
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+async def two(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncIterator[tuple[Plane, Plane]]:
+    """Two gateways that see each other."""
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(2)]
+    one = await Plane.open(PlaneConfig(listen=(endpoints[0],)), fleet="f", gateway="g0", data_dir=tmp_path / "g0")
+    config = PlaneConfig(listen=(endpoints[1],), connect=(endpoints[0],))
+    other = await Plane.open(config, fleet="f", gateway="g1", data_dir=tmp_path / "g1")
+    await _until(lambda: len(one.members()) == len(other.members()) == 2)
+    yield one, other
+    await one.close()
+    await other.close()
+
+
+def _client(plane: Plane) -> PlaneConfig:
+    return PlaneConfig(mode="client", connect=plane.config.listen, connect_timeout_s=1)
+
+
+def _container(gateway: str, name: str, state: ContainerState = ContainerState.READY) -> ContainerInfo:
+    return ContainerInfo(id=name, gateway=gateway, image="base", state=state)
+
+
+async def test_facts_spread_and_go(two: tuple[Plane, Plane]) -> None:
+    """Status and containers of one are known to the other; a container left out is gone; listeners are told."""
+    one, other = two
+    told: list[str] = []
+    other.registry.on_change.append(told.append)
+    one.registry.publish_status(GatewayStatus(id="g0", fleet="f", load=0.5))
+    one.registry.publish_containers((_container("g0", "a"), _container("g0", "b")))
+    assert one.registry.gateways["g0"].load == 0.5
+    await _until(lambda: "g0" in other.registry.gateways and len(other.registry.containers.get("g0", {})) == 2)
+    one.registry.publish_containers((_container("g0", "b", ContainerState.BUSY),))
+    await _until(lambda: list(other.registry.containers["g0"]) == ["b"])
+    await _until(lambda: other.registry.containers["g0"]["b"].state is ContainerState.BUSY)
+    assert {"gateway", "container"} <= set(told)
+
+
+async def test_a_burst_is_published_once(two: tuple[Plane, Plane]) -> None:
+    """Changes within the coalescing time become one message, the last one; unchanged containers are not repeated."""
+    one, other = two
+    seen: list[Message] = []
+    other.session.subscribe(other.keys.status(), seen.append)
+    other.session.subscribe(other.keys.container(), seen.append)
+    while not seen:
+        one.registry.publish_status(GatewayStatus(id="g0", fleet="f"))
+        await asyncio.sleep(0.05)
+    await asyncio.sleep(0.2)
+    seen.clear()
+    for load in range(50):
+        one.registry.publish_status(GatewayStatus(id="g0", fleet="f", load=load))
+        one.registry.publish_containers((_container("g0", "a"),))
+    await _until(lambda: len(seen) >= 2)
+    one.registry.publish_containers((_container("g0", "a"), _container("g0", "b")))
+    await _until(lambda: any(message.key.endswith("/b") for message in seen))
+    assert [message.key.split("/")[-1] for message in seen if message.key.endswith("/a")] == ["a"]
+    assert b'"load":49' in next(message.payload for message in seen if message.key.endswith("status"))
+
+
+async def test_latecomers_get_the_facts(two: tuple[Plane, Plane], tmp_path: Path) -> None:
+    """A gateway and a client that come later know at once what was put before, by asking every member."""
+    one, other = two
+    for plane in two:
+        plane.registry.publish_status(GatewayStatus(id=plane.gateway, fleet="f"))
+        plane.registry.publish_containers((_container(plane.gateway, f"c-{plane.gateway}"),))
+    robot = RobotInfo(id="r1", kind="zenoh")
+    while "r1" not in one.registry.robots:
+        other.session.put(other.keys.robot("r1"), encode(robot))
+        await asyncio.sleep(0.02)
+    client = await PlaneClient.open(_client(one), fleet="f")
+    assert client.members() == {"g0", "g1"}
+    assert set(client.registry.gateways) == {"g0", "g1"}
+    assert {name: list(held) for name, held in client.registry.containers.items()} == {"g0": ["c-g0"], "g1": ["c-g1"]}
+    assert client.registry.robots == {"r1": robot}
+    chosen = await client.any_gateway()
+    assert chosen in {"g0", "g1"}
+    assert await client.any_gateway() == chosen
+    await client.close()
+    late = await Plane.open(PlaneConfig(connect=one.config.listen), fleet="f", gateway="g2", data_dir=tmp_path / "g2")
+    await _until(lambda: set(late.registry.gateways) == {"g0", "g1"} and len(late.registry.containers) == 2)
+    await late.close()
+
+
+async def test_facts_of_a_lost_gateway_go(two: tuple[Plane, Plane]) -> None:
+    """When a gateway goes, its status and containers go with it, for gateways and clients."""
+    one, other = two
+    client = await PlaneClient.open(_client(one), fleet="f")
+    other.registry.publish_status(GatewayStatus(id="g1", fleet="f"))
+    other.registry.publish_containers((_container("g1", "a"),))
+    await _until(
+        lambda: all("g1" in each.registry.containers and "g1" in each.registry.gateways for each in (one, client))
+    )
+    await other.close()
+    await _until(lambda: all("g1" not in each.registry.gateways for each in (one, client)))
+    assert "g1" not in one.registry.containers
+    assert client.members() == {"g0"}
+    await client.close()
+
+
+async def test_robots_come_and_go(two: tuple[Plane, Plane]) -> None:
+    """A robot's state is known everywhere; when its token goes it is offline, and online again when it speaks."""
+    one, other = two
+    robot = await Session.open(_client(one), "f")
+    token = robot.declare_alive(robot.keys.robot_alive("r1"))
+    info = RobotInfo(id="r1", kind="zenoh", battery_percent=80)
+    while not all("r1" in plane.registry.robots for plane in two):
+        robot.put(robot.keys.robot("r1"), encode(info))
+        await asyncio.sleep(0.02)
+    assert other.registry.robots["r1"] == info
+    await asyncio.sleep(0.1)
+    token.close()
+    await _until(lambda: all(not plane.registry.robots["r1"].online for plane in two))
+    assert one.registry.robots["r1"].battery_percent == 80
+    while not all(plane.registry.robots["r1"].online for plane in two):
+        robot.put(robot.keys.robot("r1"), encode(info))
+        await asyncio.sleep(0.02)
+    await robot.close()
+
+
+async def test_malformed_and_oversize_facts(two: tuple[Plane, Plane]) -> None:
+    """On every key the registry listens to: what is malformed, oversize or misplaced is counted and changes nothing."""
+    one, other = two
+    one.registry.publish_status(GatewayStatus(id="g0", fleet="f"))
+    one.registry.publish_containers((_container("g0", "a"),))
+    await _until(lambda: "g0" in other.registry.gateways and "g0" in other.registry.containers)
+    foreign = await Session.open(_client(other), "f")
+    keys = foreign.keys
+    topics = {
+        "gw/*/status": (keys.status("g0"), encode(GatewayStatus(id="g9", fleet="f"))),
+        "gw/*/pool/*": (keys.container("g0", "a"), encode(_container("g9", "a"))),
+        "robot/*/state": (keys.robot("r1"), encode(RobotInfo(id="r9", kind="zenoh"))),
+    }
+    before = (dict(other.registry.gateways), dict(other.registry.containers))
+    size = other.config.max_payload_bytes + 1
+    for key, misplaced in topics.values():
+        for payload in (b"", b"{", b"\xff", b"[]", b"[" * 50_000, misplaced, b"x" * size):
+            foreign._raw.put(key, payload)
+    foreign.put(keys.status("stranger"), encode(GatewayStatus(id="stranger", fleet="f")))
+    bad_token = foreign._raw.liveliness().declare_token(f"{keys.root}/gw/NOT A NAME/alive")
+    await _until(
+        lambda: all(
+            other.session.refused.get(f"{how} {topic}", 0) == count
+            for topic in topics
+            for how, count in (("malformed", 5), ("misplaced", 1), ("oversize", 1))
+        )
+    )
+    await _until(lambda: other.session.refused.get("malformed gw/*/alive") == 1)
+    assert (dict(other.registry.gateways), dict(other.registry.containers)) == before
+    assert other.registry.robots == {}
+    assert other.members() == {"g0", "g1"}
+    bad_token.undeclare()
+    await foreign.close()
+
+
+async def test_a_client_of_an_empty_fleet_says_so(two: tuple[Plane, Plane]) -> None:
+    """Asking for a gateway of a fleet that has none is an error that names the fleet."""
+    client = await PlaneClient.open(_client(two[0]), fleet="nobody")
+    with pytest.raises(UnreachableError, match="fleet nobody"):
+        await client.any_gateway(timeout_s=0.1)
+    await client.close()
