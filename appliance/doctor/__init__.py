@@ -1,8 +1,10 @@
 """Checks every prerequisite of a gateway on this machine and names the remedy for each that is missing.
 
-Doors: `run_checks` and `Check`. `checks.py` decides, `machine.py` is the seam to the machine that tests fake.
+Doors: `run_checks` and `Check`. `checks.py` and `containers.py` decide; `machine.py` is the seam to the machine that
+tests fake.
 """
 
-from appliance.doctor.checks import Check, run_checks
+from appliance.doctor.check import Check
+from appliance.doctor.checks import run_checks
 
 __all__ = ["Check", "run_checks"]

@@ -10,7 +10,8 @@ import pytest
 
 from appliance.config import GatewayConfig
 from appliance.doctor import Check, run_checks
-from appliance.doctor.checks import local_checks, podman_checks
+from appliance.doctor.checks import local_checks
+from appliance.doctor.containers import podman_checks
 from appliance.doctor.machine import FileFacts
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 from appliance.plane.session import Session

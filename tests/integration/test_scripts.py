@@ -1,0 +1,80 @@
+"""The scripts around the product: what they run keeps its exit status, its arguments and its signals."""
+
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+
+def as_user(project_root: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    """Run a command by scripts/as_user.sh."""
+    return subprocess.run(
+        [str(project_root / "scripts" / "as_user.sh"), *command], capture_output=True, text=True, check=False
+    )
+
+
+def test_exit_status_is_the_commands_own(project_root: Path) -> None:
+    """What the command ends with is what as_user.sh ends with."""
+    assert as_user(project_root, "sh", "-c", "exit 7").returncode == 7
+
+
+def test_arguments_arrive_as_given(project_root: Path) -> None:
+    """Quotes, dollars, backquotes, spaces and newlines in an argument are only text."""
+    hostile = 'say "it\'s $HOME `id`"; rm -rf x\n*'
+    assert as_user(project_root, "printf", "%s", hostile).stdout == hostile
+
+
+def test_environment_is_the_working_users(project_root: Path) -> None:
+    """Home and runtime folder are the working user's, and nothing of a caller's Python or Podman is taken along."""
+    done = subprocess.run(
+        [str(project_root / "scripts" / "as_user.sh"), "env"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={"PATH": "/usr/bin:/bin", "HOME": "/tmp", "PYTHONPATH": "/x", "CONTAINER_HOST": "tcp://x"},
+    )
+    seen = dict(line.partition("=")[::2] for line in done.stdout.splitlines())
+    assert seen["XDG_RUNTIME_DIR"].startswith("/run/user/")
+    assert "PYTHONPATH" not in seen
+    assert "CONTAINER_HOST" not in seen
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_reach_the_command(project_root: Path, number: signal.Signals) -> None:
+    """SIGTERM and SIGINT are the command's own, with its own time to end: no process stands between."""
+    script = (
+        "import signal, sys, time\n"
+        f"signal.signal({number}, lambda *_: (time.sleep(0.1), sys.exit(9)))\n"
+        "print('up', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [str(project_root / "scripts" / "as_user.sh"), "python3", "-c", script], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        process.send_signal(number)
+        assert process.wait(timeout=30) == 9
+
+
+def test_an_unknown_argument_of_setup_is_refused(project_root: Path) -> None:
+    """setup.sh changes nothing when it is not understood, and says how it is used."""
+    done = subprocess.run(
+        [str(project_root / "scripts" / "setup.sh"), "everything"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "usage: scripts/setup.sh" in done.stderr
+
+
+def test_hostile_instructions_reach_the_demo_whole(project_root: Path) -> None:
+    """`make demo ASK=…` hands the text on as one argument, whatever stands in it."""
+    hostile = 'fetch "it\'s" $HOME $(id) `id`; # x'
+    done = subprocess.run(
+        ["make", "--silent", "-o", "setup", "demo", f"ASK={hostile}", "RUN=printf '<%s>'"],
+        cwd=project_root,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.endswith(f"<--ask={hostile}>")
