@@ -104,7 +104,7 @@ class Gateway:
             on_call=on_call,
             on_change=self._on_containers,
         )
-        self.executor = Executor(self.plane, self.pool)
+        self.executor = Executor(self.plane, self.pool, config.tasks)
         self.executor.on_change = self._changed.set
         await self.executor.start()
         await self.pool.start()

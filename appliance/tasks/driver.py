@@ -10,18 +10,15 @@ same attempt.
 import asyncio
 import time
 from collections.abc import Callable, Coroutine
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import structlog
-from msgspec import Struct
 
 from appliance.errors import ConflictError, PlanError, SwiftbotError
 from appliance.model import (
     Failure,
-    Need,
     Plan,
-    RunAccepted,
     RunEvent,
     RunEventKind,
     RunRequest,
@@ -32,67 +29,22 @@ from appliance.model import (
     VersionVector,
     encode,
 )
-from appliance.plane.node import Plane
-from appliance.skills.catalogue import SkillManifest
 from appliance.tasks import machine
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.placement import Placement
-from appliance.tasks.settings import TasksConfig
+from appliance.tasks.surroundings import (
+    CancelAsked,
+    GatewayLost,
+    Input,
+    RunNews,
+    Surroundings,
+    Wake,
+    deadline_s,
+    need_of,
+    task_key,
+)
 
 log = structlog.get_logger(__name__)
-
-
-class Surroundings(Protocol):
-    """What a driver needs of its gateway; the coordinator provides it."""
-
-    plane: Plane
-    config: TasksConfig
-
-    async def plan(self, record: TaskRecord) -> Plan:
-        """Return a valid plan, the one handed in with the task or a new one; PlanError otherwise."""
-        ...
-
-    def manifest(self, skill: str) -> SkillManifest:
-        """Return a skill's manifest."""
-        ...
-
-    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
-        """Choose the robot of a subtask, or None with the reason for the wait."""
-        ...
-
-    def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
-        """Order the gateways for a subtask."""
-        ...
-
-    async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
-        """Send a run order, to this gateway without a detour."""
-        ...
-
-
-class RunNews(Struct, frozen=True):
-    """A run event came."""
-
-    event: RunEvent
-
-
-class GatewayLost(Struct, frozen=True):
-    """A gateway is gone."""
-
-    gateway: str
-
-
-class CancelAsked(Struct, frozen=True):
-    """Somebody wants it to stop."""
-
-    by: str = ""
-
-
-class Wake(Struct, frozen=True):
-    """Look again: a timer, a new robot, a new gateway."""
-
-
-Input = RunNews | GatewayLost | CancelAsked | Wake
 
 
 class SupersededError(SwiftbotError):
@@ -252,7 +204,10 @@ class Driver:
 
     async def _send(self, gateway: str, request: RunRequest) -> None:
         try:
-            await self._around.order(gateway, request)
+            accepted = await self._around.order(gateway, request)
+            if accepted.gateway != gateway:
+                # Passed on to a warm container: from now on that gateway answers for the run.
+                self.tell(RunNews(_event(request, accepted.gateway, RunEventKind.PROGRESS)))
         except SwiftbotError as error:
             failure = Failure(
                 code=error.code if error.code in ("refused", "pool") else "unreachable",
@@ -260,7 +215,7 @@ class Driver:
                 remedy=error.remedy,
                 retryable=True,
             )
-            self.tell(RunNews(_failed_event(request, gateway, failure)))
+            self.tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
 
     def _inputs(self, target: SubtaskRecord) -> dict[str, dict[str, Any]]:
         """Results of the subtasks it comes after, directly or not: a report needs the picture two steps back."""
@@ -483,22 +438,6 @@ class Driver:
         raise SupersededError(f"the record has moved on to {holder or 'nobody'}")
 
 
-def task_key(task: str) -> str:
-    """Key of a task's record in the DHT."""
-    return f"task/{task}"
-
-
-def need_of(manifest: SkillManifest) -> Need:
-    """What a skill asks of a container."""
-    return Need(image=manifest.image, cpu=manifest.cpu, memory_mb=manifest.memory_mb, volumes=manifest.volumes)
-
-
-def deadline_s(manifest: SkillManifest, params: dict[str, Any]) -> float:
-    """Time a run may take: the skill's own, beyond the duration that was asked for."""
-    asked = params.get("duration_s", 0.0)
-    return manifest.timeout_s + (float(asked) if isinstance(asked, int | float) else 0.0)
-
-
 def _with_failure(target: SubtaskRecord, failure: Failure) -> SubtaskRecord:
     if not target.attempts or target.state is SubtaskState.READY:
         return target
@@ -512,12 +451,12 @@ def _plan_failure(error: SwiftbotError) -> Failure:
     return Failure(code=error.code, message=message, remedy=error.remedy)
 
 
-def _failed_event(request: RunRequest, gateway: str, failure: Failure) -> RunEvent:
+def _event(request: RunRequest, gateway: str, kind: RunEventKind, failure: Failure | None = None) -> RunEvent:
     return RunEvent(
         task=request.task,
         subtask=request.subtask,
         attempt=request.attempt,
-        kind=RunEventKind.FAILED,
+        kind=kind,
         gateway=gateway,
         failure=failure,
     )

@@ -7,7 +7,8 @@ coordinator that comes later can ask.
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 import msgspec
 import structlog
@@ -21,12 +22,15 @@ from appliance.model import (
     RunEvent,
     RunEventKind,
     RunRequest,
+    TaskRecord,
     encode,
 )
 from appliance.plane.node import Plane
+from appliance.plane.session import Closer, Message
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.settings import TasksConfig
 
 log = structlog.get_logger(__name__)
 
@@ -37,12 +41,15 @@ KEPT_RUNS = 2000
 class Executor:
     """The runs of one gateway."""
 
-    def __init__(self, plane: Plane, pool: Pool) -> None:
+    def __init__(self, plane: Plane, pool: Pool, config: TasksConfig) -> None:
         self._plane = plane
+        self._config = config
+        self._records: Closer | None = None
         self._pool = pool
         self._running: dict[str, asyncio.Task[None]] = {}
         self._accepted: dict[str, RunAccepted] = {}
         self._last: dict[str, RunEvent] = {}
+        self._background: set[asyncio.Future[object]] = set()
         self._attempts: dict[tuple[str, str], int] = {}
         self.draining = False
         self.on_change: Callable[[], None] = lambda: None
@@ -54,6 +61,7 @@ class Executor:
 
     async def start(self) -> None:
         """Load what was kept; a run that was in progress when the gateway went down has failed."""
+        self._records = self._plane.session.subscribe(self._plane.keys.task(), self._on_record)
         for key, value in await self._plane.store.scan("run/"):
             event = msgspec.json.decode(value, type=RunEvent)
             run_id = key.removeprefix("run/")
@@ -86,6 +94,7 @@ class Executor:
         if self.draining:
             raise RefusedError(f"{self._plane.gateway} is draining", remedy="another gateway takes it")
         self._attempts[(request.task, request.subtask)] = request.attempt
+        await self._end_older(request)
         received_ns = time.monotonic_ns()
         decision = await self._pool.select(request.need, allow_remote=request.hops == 0)
         if decision.phase is Phase.REMOTE_WARM:
@@ -143,6 +152,14 @@ class Executor:
             final = _failed(
                 request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
             )
+        size = len(encode(final.result))
+        if size > self._config.max_result_bytes:
+            failure = Failure(
+                code="payload",
+                message=f"the result has {size:,} bytes, more than {self._config.max_result_bytes:,}",
+                remedy="have the handler put it into an artifact",
+            )
+            final = replace(final, kind=RunEventKind.FAILED, result=None, failure=failure)
         final = replace(final, gateway=self._plane.gateway, phase=_seen_from_afar(final.phase, request))
         self._remember(run_id, final)
         await begun
@@ -175,14 +192,45 @@ class Executor:
         self._attempts[key] = max(event.attempt, self._attempts.get(key, 0))
         while len(self._last) > KEPT_RUNS:
             oldest = next(each for each in self._last if each not in self._running)
-            gone = self._last.pop(oldest)
-            self._accepted.pop(oldest, None)
-            self._attempts.pop((gone.task, gone.subtask), None)
-            self._forget_later(oldest)
+            self._forget(oldest)
 
-    def _forget_later(self, run_id: str) -> None:
-        forgetting = asyncio.ensure_future(self._plane.store.delete(f"run/{run_id}"))
-        forgetting.add_done_callback(lambda done: done.exception())
+    def _forget(self, run_id: str) -> None:
+        gone = self._last.pop(run_id)
+        self._accepted.pop(run_id, None)
+        self._attempts.pop((gone.task, gone.subtask), None)
+        self._later(self._plane.store.delete(f"run/{run_id}"))
+
+    async def _end_older(self, request: RunRequest) -> None:
+        """End an outdated attempt that still runs here."""
+        for run_id in [each for each in self._running if each.startswith(f"{request.task}/{request.subtask}/")]:
+            if run_id != request.run_id:
+                await self._pool.cancel(run_id)
+
+    def _on_record(self, message: Message) -> None:
+        """End runs whose attempt the record has left behind; forget the runs of a task that has ended."""
+        task = message.key.split("/")[-2]
+        mine = [run_id for run_id in self._last if run_id.startswith(f"{task}/")]
+        if not mine or message.deleted:
+            return
+        try:
+            record = msgspec.json.decode(message.payload, type=TaskRecord)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            self._plane.session.refuse("malformed task", key=message.key)
+            return
+        attempts = {each.subtask.id: each.attempt for each in record.subtasks}
+        for run_id in mine:
+            event = self._last[run_id]
+            outdated = event.attempt < attempts.get(event.subtask, 0)
+            if run_id in self._running:
+                if outdated or record.state.final:
+                    self._later(self._pool.cancel(run_id))
+            elif record.state.final:
+                self._forget(run_id)
+
+    def _later(self, work: Coroutine[Any, Any, object]) -> None:
+        task = asyncio.ensure_future(work)
+        self._background.add(task)
+        task.add_done_callback(self._background.discard)
 
     def _ended(self, run_id: str) -> None:
         self._running.pop(run_id, None)
@@ -202,6 +250,8 @@ class Executor:
         """Accept nothing more and wait for the runs in progress; what is left then is cancelled."""
         self.draining = True
         self.on_change()
+        if self._records is not None:
+            self._records.close()
         if self._running:
             await asyncio.wait(list(self._running.values()), timeout=deadline_s)
         for run_id in list(self._running):

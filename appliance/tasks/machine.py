@@ -198,7 +198,8 @@ def _progress(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
     if target.state.final or event.attempt != target.attempt:
         raise StaleTransitionError(f"progress of attempt {event.attempt} of {event.subtask}, which is {target.state}")
-    return _with(record, replace(target, progress=event.progress, note=event.note))
+    gateway = target.gateway if target.state is SubtaskState.READY else event.gateway or target.gateway
+    return _with(record, replace(target, progress=event.progress, note=event.note, gateway=gateway))
 
 
 def _succeeded(record: TaskRecord, event: Transition) -> TaskRecord:

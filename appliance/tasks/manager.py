@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable
 from typing import cast
 
@@ -47,11 +48,12 @@ from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
-from appliance.tasks.driver import CancelAsked, Driver, GatewayLost, RunNews, Wake, need_of, task_key
+from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement, bind, place
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, need_of, task_key
 
 log = structlog.get_logger(__name__)
 
@@ -77,6 +79,8 @@ class TaskManager:
         self._site = site
         self._drivers: dict[str, Driver] = {}
         self._driving: dict[str, asyncio.Task[None]] = {}
+        self._breaks: Counter[str] = Counter()
+        """How often a task's driver has broken; each time it is left alone for longer."""
         self._closers: list[Callable[[], None]] = []
         self._stopping = False
         self._sweep = asyncio.Event()
@@ -203,8 +207,10 @@ class TaskManager:
         if not done.cancelled() and (error := done.exception()) is not None:
             # The record stands as it was last written: a new driver takes it up from there.
             log.error("driver broke", task=driver.record.id, exc_info=error)
+            self._breaks[driver.record.id] += 1
         if not driver.record.state.final and not self._stopping:
-            asyncio.get_running_loop().call_later(0.5, self._sweep.set)
+            pause_s = min(30.0, 0.5 * 2 ** self._breaks[driver.record.id])
+            asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
         else:
             log.info("task ended", task=driver.record.id, state=str(driver.record.state))
         self.on_change()

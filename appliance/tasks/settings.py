@@ -24,5 +24,7 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """How long after its deadline, or after a cancel, a silent run is given up."""
     max_artifact_mb: int = 64
     """Largest file a handler may store."""
+    max_result_bytes: int = 48 * 1024
+    """Largest result of a subtask, as JSON: 64 of them still fit into one record. Larger things are files."""
     keep_finished: int = 500
     """Finished task records kept in this gateway's shard."""

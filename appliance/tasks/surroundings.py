@@ -1,0 +1,79 @@
+"""What a driver needs of its gateway, and what it is told: the seam between driving a task and the world."""
+
+from typing import Any, Protocol
+
+from msgspec import Struct
+
+from appliance.model import Need, Plan, RunAccepted, RunEvent, RunRequest, SubtaskRecord, TaskRecord
+from appliance.plane.node import Plane
+from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.placement import Placement
+from appliance.tasks.settings import TasksConfig
+
+
+class Surroundings(Protocol):
+    """What a driver needs of its gateway; the coordinator provides it."""
+
+    plane: Plane
+    config: TasksConfig
+
+    async def plan(self, record: TaskRecord) -> Plan:
+        """Return a valid plan, the one handed in with the task or a new one; PlanError otherwise."""
+        ...
+
+    def manifest(self, skill: str) -> SkillManifest:
+        """Return a skill's manifest."""
+        ...
+
+    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
+        """Choose the robot of a subtask, or None with the reason for the wait."""
+        ...
+
+    def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
+        """Order the gateways for a subtask."""
+        ...
+
+    async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
+        """Send a run order, to this gateway without a detour."""
+        ...
+
+
+class RunNews(Struct, frozen=True):
+    """A run event came."""
+
+    event: RunEvent
+
+
+class GatewayLost(Struct, frozen=True):
+    """A gateway is gone."""
+
+    gateway: str
+
+
+class CancelAsked(Struct, frozen=True):
+    """Somebody wants it to stop."""
+
+    by: str = ""
+
+
+class Wake(Struct, frozen=True):
+    """Look again: a timer, a new robot, a new gateway."""
+
+
+Input = RunNews | GatewayLost | CancelAsked | Wake
+
+
+def task_key(task: str) -> str:
+    """Key of a task's record in the DHT."""
+    return f"task/{task}"
+
+
+def need_of(manifest: SkillManifest) -> Need:
+    """What a skill asks of a container."""
+    return Need(image=manifest.image, cpu=manifest.cpu, memory_mb=manifest.memory_mb, volumes=manifest.volumes)
+
+
+def deadline_s(manifest: SkillManifest, params: dict[str, Any]) -> float:
+    """Time a run may take: the skill's own, beyond the duration that was asked for."""
+    asked = params.get("duration_s", 0.0)
+    return manifest.timeout_s + (float(asked) if isinstance(asked, int | float) else 0.0)
