@@ -17,24 +17,27 @@ HIDDEN = 32
 HEADS = 2
 HEAD = HIDDEN // HEADS
 CONTEXT = 32768
+TERSE = '}]"'
+"""Ends objects, lists and texts as soon as it may."""
+WORDY = ',"'
+"""Goes on with lists as long as it may, and ends texts at once."""
 SPECIALS = ("<|end|>", "<|pad|>")
 
 
-def build(folder: Path, *, seed: int = 7, terse: bool = True) -> Path:
+def build(folder: Path, *, seed: int = 7, like: str = TERSE) -> Path:
     """Write the model into `folder` (made if need be) and return it.
 
     Args:
         folder: where to.
         seed: of the weights.
-        terse: prefer quotes and closing brackets, so that plans are short; else they run on to the grammar's bounds.
+        like: symbols it prefers, the first most; `TERSE` makes short plans, `WORDY` long ones.
     """
     folder.mkdir(parents=True, exist_ok=True)
     size = _tokenizer(folder)
     bias = np.zeros(size, dtype=np.float32)
-    if terse:
-        alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-        for symbol, strength in (('"', 30.0), ("]", 60.0), ("}", 60.0)):
-            bias[alphabet.index(symbol)] = strength
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    for place, symbol in enumerate(reversed(like)):
+        bias[alphabet.index(symbol)] = 30.0 * (place + 1)
     _decoder(folder / "model.onnx", size, np.random.default_rng(seed), bias)
     end, pad = size - 2, size - 1
     config = {

@@ -26,6 +26,8 @@ GRAMMAR_SUBTASKS = 32
 """Longest plan the grammar allows: twice the longest of the development set, and a bound on its size."""
 MAX_ANSWER_BYTES = 256 * 1024
 _NAME_LIKE = re.compile(r"\b[A-Za-z][A-Za-z0-9]*(?:[_-][A-Za-z0-9]+|[ ]\d{1,4}\b|\d{1,4}\b)")
+_DIRECT = 11
+"""Further direct predecessors of a subtask: a list without bound is one to loop in."""
 _DOMAIN = '"domain":'
 _ANY = 4
 """Unnamed robots: any, any1 ... any4."""
@@ -127,7 +129,7 @@ def _grammar(skills: tuple[Shape, ...], domains: tuple[str, ...], names: tuple[s
         follow = f" ({comma} t{index + 1})?" if index < GRAMMAR_SUBTASKS else ""
         lines.append(f"t{index}: {head} action {after} after{index} {close}{follow}")
         if index > 1:
-            lines.append(f"after{index}: (d{index} ({comma} d{index})*)?")
+            lines.append(f"after{index}: (d{index} ({comma} d{index}){{0,{_DIRECT}}})?")
             lines.append(f"d{index}: {_choice(_quoted(f's{earlier}') for earlier in range(1, index))}")
     for skill in skills:
         robot = _text("null") if skill.compute else "robot"
@@ -135,8 +137,8 @@ def _grammar(skills: tuple[Shape, ...], domains: tuple[str, ...], names: tuple[s
         lines.append(f"a_{skill.id}: {head} {robot} {params} {_params(skill)} {_text('}')}")
     lines += [
         f"robot: {_choice(_quoted(name) for name in names)}" if names else 'robot: /"[a-z][a-z0-9_-]{0,40}"/',
-        f"robots: {_text('[')} robot ({_text(',')} robot)* {_text(']')}",
-        f"strings: {_text('[')} STRING ({_text(',')} STRING)* {_text(']')}",
+        f"robots: {_text('[')} robot ({_text(',')} robot){{0,15}} {_text(']')}",
+        f"strings: {_text('[')} STRING ({_text(',')} STRING){{0,15}} {_text(']')}",
         # Bounded, and without control characters, quotes and backslashes: a parameter needs none of them.
         r'STRING: /"[^"\\\x00-\x1f\x7f]{1,120}"/',
         "NUMBER: /[1-9][0-9]{0,5}(\\.[0-9]{1,3})?|0\\.[0-9]{0,2}[1-9]/",
@@ -217,7 +219,7 @@ def read_plan(text: str, *, tier: Tier) -> Plan:
             skill=each.skill,
             robot=each.robot or None,
             params={name: value for name, value in (each.params or {}).items() if value is not None},
-            after=tuple(each.after or ()),
+            after=tuple(dict.fromkeys(each.after or ())),
         )
         for each in found.subtasks
     )

@@ -37,6 +37,10 @@ def lines(text: str, *roster: str, site: Site | None = None) -> list[str]:
     ]
 
 
+TWO_ROBOTS = (
+    "Drone_1 take off to 10 m, go to goal 2, photograph the yard and land, while Rover_1 fetches the blue box "
+    "from dock 1 and places it at dock 2"
+)
 CASES: list[tuple[str, tuple[str, ...], list[str]]] = [
     (
         "Robot_1 fetch the red box from dock 3 while Robot_2 films the aisle",
@@ -54,8 +58,7 @@ CASES: list[tuple[str, tuple[str, ...], list[str]]] = [
         ],
     ),
     (
-        "Drone_1 take off to 10 m, go to goal 2, photograph the yard and land, "  # a list, then another robot's
-        + "while Rover_1 fetches the blue box from dock 1 and places it at dock 2",
+        TWO_ROBOTS,
         ("drone_1", "rover_1"),
         [
             "s1 takeoff drone_1 altitude_m=10",

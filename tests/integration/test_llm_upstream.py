@@ -1,0 +1,240 @@
+"""The upstream tier against real HTTP servers: what works, and every way in which a server can misbehave."""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.errors import ConfigError, DeadlineError, PayloadError, PlanError, SwiftbotError, UnreachableError
+from appliance.llm.cascade import Decomposer
+from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.upstream import UpstreamTier
+from appliance.model import Tier
+from appliance.skills.catalogue import load_catalogue
+
+pytestmark = pytest.mark.anyio
+
+CATALOGUE = load_catalogue()
+ASK = PlanContext(instruction="Rover_1: go to dock 1")
+PLAN = {
+    "domain": "navigation",
+    "subtasks": [{"id": "s1", "skill": "goto", "robot": "rover_1", "params": {"place": "dock 1"}, "after": []}],
+}
+BAD = {
+    "domain": "navigation",
+    "subtasks": [{"id": "s1", "skill": "dance", "robot": "rover_1", "params": {}, "after": []}],
+}
+
+Answer = tuple[int, bytes] | float
+"""Status and body, or seconds of silence."""
+
+
+def completion(content: Any, **more: Any) -> tuple[int, bytes]:
+    """Return a chat completion as servers send it."""
+    text = content if isinstance(content, str) else json.dumps(content)
+    choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop", **more}
+    return 200, json.dumps({"id": "c1", "object": "chat.completion", "choices": [choice], "usage": {}}).encode()
+
+
+class Server:
+    """An OpenAI-compatible server that answers as it is told, in order; the last answer stays."""
+
+    def __init__(self) -> None:
+        self.answers: list[Answer | Callable[[dict[str, Any]], Answer]] = []
+        self.asked: list[dict[str, Any]] = []
+        self.paths: list[str] = []
+        self.keys: list[str | None] = []
+        self.closing = threading.Event()
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                server.handle(self)
+
+            def log_message(self, *_: Any) -> None:
+                """Say nothing."""
+
+        self._http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._http.daemon_threads = True
+        self._thread = threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.02})
+        self._thread.start()
+        self.url = f"http://127.0.0.1:{self._http.server_address[1]}/v1"
+
+    def handle(self, request: BaseHTTPRequestHandler) -> None:
+        """Answer one request."""
+        body = json.loads(request.rfile.read(int(request.headers["content-length"])))
+        self.asked.append(body)
+        self.paths.append(request.path)
+        self.keys.append(request.headers.get("authorization"))
+        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        answer = answer(body) if callable(answer) else answer
+        if isinstance(answer, float):
+            self.closing.wait(answer)
+            return
+        status, data = answer
+        request.send_response(status)
+        request.send_header("content-length", str(len(data)))
+        request.end_headers()
+        request.wfile.write(data)
+
+    def close(self) -> None:
+        """Stop."""
+        self.closing.set()
+        self._http.shutdown()
+        self._http.server_close()
+        self._thread.join()
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    """Return a running server."""
+    running = Server()
+    yield running
+    running.close()
+
+
+def config(server: Server, **more: Any) -> LlmConfig:
+    """Return a configuration that points at the server."""
+    return LlmConfig(**{"upstream_url": server.url, "upstream_model": "big", "upstream_deadline_s": 5.0, **more})
+
+
+async def ask(server: Server, **more: Any) -> Any:
+    """Put one instruction to an upstream tier and close it."""
+    tier = UpstreamTier(config(server, **more), CATALOGUE)
+    await tier.start()
+    try:
+        return await tier.propose(ASK)
+    finally:
+        await tier.close()
+
+
+async def test_plan_from_a_server(server: Server, tmp_path: Path) -> None:
+    """A plan comes back; the request holds model, schema, prompt and key as OpenAI's interface has them."""
+    key = tmp_path / "key"
+    key.write_text("secret-1\n")
+    server.answers = [completion(PLAN)]
+    proposal = await ask(server, upstream_key_file=str(key))
+    assert proposal.plan.tier is Tier.UPSTREAM
+    assert proposal.plan.subtasks[0].params == {"place": "dock 1"}
+    (body,) = server.asked
+    assert server.paths == ["/v1/chat/completions"]
+    assert server.keys == ["Bearer secret-1"]
+    assert body["model"] == "big"
+    assert body["response_format"]["json_schema"]["schema"]["required"] == ["domain", "subtasks"]
+    assert body["messages"][0]["role"] == "system"
+    assert "Rover_1: go to dock 1" in body["messages"][-1]["content"]
+
+
+async def test_log_probabilities_become_the_confidence(server: Server) -> None:
+    """Where the server tells token probabilities, doubt in some of them lowers the confidence."""
+    server.answers = [
+        completion(PLAN, logprobs={"content": [{"token": "a", "logprob": -0.0001}, {"token": "b", "logprob": -0.7}]})
+    ]
+    assert (await ask(server)).confidence == pytest.approx(0.4966, abs=1e-3)
+
+
+async def test_refused_schema_falls_back_and_is_remembered(server: Server) -> None:
+    """A server that refuses json_schema is asked for json_object, then for plain text, and from then on so."""
+
+    def picky(body: dict[str, Any]) -> Answer:
+        refused = "response_format" in body
+        return (400, b'{"error": {"message": "response_format is not supported"}}') if refused else completion(PLAN)
+
+    server.answers = [picky]
+    tier = UpstreamTier(config(server), CATALOGUE)
+    try:
+        await tier.propose(ASK)
+        await tier.propose(ASK)
+    finally:
+        await tier.close()
+    formats = [(body.get("response_format") or {"type": "none"})["type"] for body in server.asked]
+    assert formats == ["json_schema", "json_object", "none", "none"]
+
+
+async def test_failing_server_is_tried_again_within_bounds(server: Server) -> None:
+    """One 503 is tried again and forgotten; a server that keeps failing is an UnreachableError that says so."""
+    server.answers = [(503, b"warming up"), completion(PLAN)]
+    assert (await ask(server)).plan.subtasks
+    server.answers = [(500, b"kaputt")]
+    with pytest.raises(UnreachableError, match=r"answers 500: 'kaputt'"):
+        await ask(server)
+    assert len(server.asked) == 2 + 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind", "said"),
+    [
+        ((401, b"{}"), ConfigError, "refuses the key"),
+        ((404, b"no such model"), ConfigError, "no such model"),
+        ((413, b"too long"), PayloadError, "413"),
+        ((200, b"<html>hello</html>"), PayloadError, "no chat completion"),
+        ((200, b'{"choices": "none"}'), PayloadError, "no chat completion"),
+        ((200, b'{"choices": []}'), PlanError, "holds no plan"),
+        ((200, b"[" * 200_000), PayloadError, "no chat completion"),
+        ((200, b" " * (2 * 2**20)), PayloadError, "longer than"),
+        (completion("I cannot help with that."), PlanError, "holds no plan"),
+        (completion('{"domain": "navigation"}'), PlanError, "missing required field"),
+        (completion('{"domain": "navi', finish_reason="length"), PayloadError, "cut off"),
+    ],
+)
+async def test_bad_answers_are_named(server: Server, answer: Answer, kind: type[SwiftbotError], said: str) -> None:
+    """Each way of answering wrongly is an error of its kind, with the cause, after one request."""
+    server.answers = [answer]
+    with pytest.raises(kind, match=said):
+        await ask(server)
+    assert len(server.asked) == 1
+
+
+async def test_slow_server_is_a_deadline(server: Server) -> None:
+    """A server that does not answer is given up after the deadline, without a key in the message."""
+    server.answers = [30.0]
+    with pytest.raises(DeadlineError, match="did not answer in time"):
+        await ask(server, upstream_deadline_s=0.2, upstream_retries=0)
+
+
+async def test_no_server_is_unreachable(server: Server) -> None:
+    """A port where nothing listens is an UnreachableError that names the address."""
+    server.close()
+    with pytest.raises(UnreachableError, match=server.url):
+        await ask(server, upstream_retries=0)
+
+
+@pytest.mark.parametrize("content", [b"two words", b"\xff\xfe", "schlüssel".encode()])
+async def test_bad_key_file(server: Server, tmp_path: Path, content: bytes) -> None:
+    """A key file that holds no key is a ConfigError that names the file and not its content."""
+    key = tmp_path / "key"
+    key.write_bytes(content)
+    with pytest.raises(ConfigError, match="key") as caught:
+        await ask(server, upstream_key_file=str(key))
+    assert "two words" not in str(caught.value)
+
+
+async def test_invalid_plan_is_repaired_over_http(server: Server) -> None:
+    """The cascade asks the same server once more with the validator's words, and takes the mended plan."""
+    server.answers = [completion(BAD), completion(PLAN)]
+    cascade = Decomposer(config(server, tiers=("upstream",)), CATALOGUE)
+    try:
+        outcome = await cascade.plan(ASK)
+    finally:
+        await cascade.close()
+    assert outcome.plan.tier is Tier.UPSTREAM
+    assert "there is no such skill" in server.asked[1]["messages"][-1]["content"]
+
+
+async def test_rules_answer_when_the_server_hangs(server: Server) -> None:
+    """With a server that hangs, a plain order is still planned, by rules, after the deadline."""
+    server.answers = [30.0]
+    cascade = Decomposer(config(server, upstream_deadline_s=0.2), CATALOGUE)
+    began = time.monotonic()
+    try:
+        outcome = await cascade.plan(ASK)
+    finally:
+        await cascade.close()
+    assert outcome.plan.tier is Tier.RULES
+    assert [attempt.tier for attempt in outcome.attempts] == ["upstream", "rules"]
+    assert time.monotonic() - began < 30

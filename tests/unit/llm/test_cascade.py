@@ -1,0 +1,282 @@
+"""The cascade: order, thresholds, repair, deadlines, broken tiers. Tiers are fakes at the one seam; plans are real."""
+
+import asyncio
+import subprocess
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from appliance.errors import ConfigError, PlanError, UnreachableError
+from appliance.llm.cascade import Decomposer, Slot
+from appliance.llm.rules.tier import RulesTier
+from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.tier import Proposal
+from appliance.model import Plan, RobotInfo, Site, Subtask, Tier
+from appliance.skills.catalogue import Catalogue
+
+pytestmark = pytest.mark.anyio
+
+ASK = PlanContext(instruction="go to dock 1")
+
+
+def going(place: str = "dock 1", *, robot: str = "any") -> Plan:
+    """Return a plan of one goto."""
+    return Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="goto", robot=robot, params={"place": place}),))
+
+
+BAD = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="dance", robot="any"),))
+
+
+class FakeTier:
+    """A planner that does what it is told: a proposal, an error, or nothing for ever."""
+
+    def __init__(self, name: Tier, *answers: Proposal | Exception | None, repairs: bool = True) -> None:
+        self.name = name
+        self.repairs = repairs
+        self.answers = list(answers)
+        self.asked: list[tuple[Plan | None, tuple[str, ...]]] = []
+        self.closed = False
+        self.fail_start: Exception | None = None
+        self.fail_close: Exception | None = None
+
+    async def start(self) -> None:
+        """Start, or fail as told."""
+        if self.fail_start:
+            raise self.fail_start
+
+    async def propose(
+        self, context: PlanContext, *, previous: Plan | None = None, problems: tuple[str, ...] = ()
+    ) -> Proposal:
+        """Give the next answer."""
+        del context
+        self.asked.append((previous, problems))
+        answer = self.answers.pop(0)
+        if answer is None:
+            await asyncio.Event().wait()
+        if isinstance(answer, Exception):
+            raise answer
+        assert answer is not None
+        return answer
+
+    async def close(self) -> None:
+        """Close, or fail as told."""
+        self.closed = True
+        if self.fail_close:
+            raise self.fail_close
+
+
+Build = Callable[..., Decomposer]
+
+
+@pytest.fixture
+def build(catalogue: Catalogue) -> Build:
+    """Return a function that makes a cascade of these tiers, each sure from 0.6 on."""
+
+    def make(*tiers: FakeTier, deadline_s: float = 5.0, max_words: int = 50, **config: object) -> Decomposer:
+        slots = [
+            Slot(
+                planner=tier,
+                deadline_s=deadline_s,
+                min_confidence=0.6,
+                max_words=max_words if tier.name is Tier.LOCAL else 50,
+                leaves_machine=tier.name is Tier.UPSTREAM,
+            )
+            for tier in tiers
+        ]
+        return Decomposer(LlmConfig(**config), catalogue, slots=slots)  # type: ignore[arg-type]
+
+    return make
+
+
+def sure(plan: Plan, confidence: float = 0.9) -> Proposal:
+    """Return a proposal."""
+    return Proposal(plan=plan, confidence=confidence)
+
+
+async def test_first_tier_that_is_valid_and_sure_wins(build: Build) -> None:
+    """The first good plan is taken, stamped with its tier, and nobody else is asked."""
+    local, upstream = FakeTier(Tier.LOCAL, sure(going())), FakeTier(Tier.UPSTREAM)
+    outcome = await build(local, upstream).plan(ASK)
+    assert (outcome.plan.tier, outcome.plan.confidence) == (Tier.LOCAL, 0.9)
+    assert [attempt.tier for attempt in outcome.attempts] == ["local"]
+    assert upstream.asked == []
+
+
+async def test_invalid_plan_is_repaired_once_with_the_problems(build: Build) -> None:
+    """A model whose plan is not valid is asked once more, with the plan and what is wrong with it."""
+    local = FakeTier(Tier.LOCAL, sure(BAD), sure(going()))
+    outcome = await build(local).plan(ASK)
+    assert outcome.plan.subtasks == going().subtasks
+    previous, problems = local.asked[1]
+    assert previous == BAD
+    assert "there is no such skill" in problems[0]
+
+
+async def test_plan_that_stays_invalid_escalates(build: Build) -> None:
+    """After one repair in vain the next tier is asked, and the attempt says what was wrong."""
+    local, upstream = FakeTier(Tier.LOCAL, sure(BAD), sure(BAD)), FakeTier(Tier.UPSTREAM, sure(going()))
+    outcome = await build(local, upstream).plan(ASK)
+    assert outcome.plan.tier is Tier.UPSTREAM
+    assert len(local.asked) == 2
+    assert not outcome.attempts[0].ok
+    assert "no such skill" in outcome.attempts[0].problems[0]
+
+
+@pytest.mark.parametrize("config", [{"repair": False}, {}])
+async def test_no_repair_where_it_cannot_help(build: Build, config: dict[str, bool]) -> None:
+    """Without `repair`, or with a tier that does not repair, an invalid plan is not asked for again."""
+    tier = FakeTier(Tier.LOCAL, sure(BAD), sure(going()), repairs=not config)
+    tier.repairs = bool(config)
+    with pytest.raises(PlanError):
+        await build(tier, **config).plan(ASK)
+    assert len(tier.asked) == 1
+
+
+async def test_slow_tier_is_abandoned(build: Build) -> None:
+    """A tier that gives no answer within its deadline is left for the next one."""
+    local, upstream = FakeTier(Tier.LOCAL, None), FakeTier(Tier.UPSTREAM, sure(going()))
+    outcome = await build(local, upstream, deadline_s=0.05).plan(ASK)
+    assert outcome.plan.tier is Tier.UPSTREAM
+    assert "no answer within 0.05 s" in outcome.attempts[0].problems[0]
+
+
+@pytest.mark.parametrize(
+    ("failure", "said"),
+    [
+        (UnreachableError("server is away", remedy="wait"), "server is away (wait)"),
+        (RuntimeError("boom"), "internal error: RuntimeError('boom')"),
+        (PlanError("looped", problems=("no end",)), "looped"),
+    ],
+)
+async def test_failing_tier_is_left_for_the_next(build: Build, failure: Exception, said: str) -> None:
+    """Whatever a tier raises, the next is asked, and the attempt keeps the reason."""
+    outcome = await build(FakeTier(Tier.LOCAL, failure), FakeTier(Tier.RULES, sure(going()))).plan(ASK)
+    assert outcome.plan.tier is Tier.RULES
+    assert outcome.attempts[0].problems[0] == said
+
+
+async def test_unsure_plan_is_kept_for_when_nothing_better_comes(build: Build) -> None:
+    """A valid plan below the threshold escalates, and is taken in the end if no tier does better."""
+    local = FakeTier(Tier.LOCAL, sure(going("dock 1"), 0.5))
+    upstream = FakeTier(Tier.UPSTREAM, UnreachableError("away"))
+    outcome = await build(local, upstream).plan(ASK)
+    assert (outcome.plan.tier, outcome.plan.confidence) == (Tier.LOCAL, 0.5)
+    assert [attempt.ok for attempt in outcome.attempts] == [True, False]
+
+
+async def test_very_unsure_plan_is_not_taken(build: Build) -> None:
+    """Below the floor even a valid plan is refused."""
+    with pytest.raises(PlanError, match=r"confidence 0\.10 is below 0\.60"):
+        await build(FakeTier(Tier.LOCAL, sure(going(), 0.1))).plan(ASK)
+
+
+async def test_private_instruction_does_not_leave_the_machine(build: Build) -> None:
+    """The upstream tier is not asked for a private instruction, and the attempt says so."""
+    upstream = FakeTier(Tier.UPSTREAM)
+    outcome = await build(upstream, FakeTier(Tier.RULES, sure(going()))).plan(
+        PlanContext(instruction="go to dock 1", private=True)
+    )
+    assert upstream.asked == []
+    assert "private" in outcome.attempts[0].problems[0]
+
+
+async def test_long_instruction_skips_the_small_model(build: Build) -> None:
+    """An instruction beyond what a tier is good at goes to the next one."""
+    local, rules = FakeTier(Tier.LOCAL), FakeTier(Tier.UPSTREAM, sure(going()))
+    outcome = await build(local, rules, max_words=3).plan(ASK)
+    assert local.asked == []
+    assert outcome.plan.tier is Tier.UPSTREAM
+
+
+async def test_confidence_out_of_range_is_held(build: Build) -> None:
+    """A confidence above 1 is no more than sure."""
+    assert (await build(FakeTier(Tier.LOCAL, sure(going(), 7.0))).plan(ASK)).plan.confidence == 1.0
+
+
+async def test_calls_at_the_same_time_do_not_mix(build: Build) -> None:
+    """Two instructions planned at once each get their own attempts."""
+    cascade = build(FakeTier(Tier.LOCAL, sure(going("a")), sure(going("b"))))
+    first, second = await asyncio.gather(cascade.plan(ASK), cascade.plan(ASK))
+    assert {first.plan.subtasks[0].params["place"], second.plan.subtasks[0].params["place"]} == {"a", "b"}
+    assert (len(first.attempts), len(second.attempts)) == (1, 1)
+
+
+async def test_start_and_close_survive_a_bad_tier(build: Build) -> None:
+    """A tier that cannot start does not keep the others from starting, nor one that cannot close from closing."""
+    bad, good = FakeTier(Tier.LOCAL), FakeTier(Tier.UPSTREAM)
+    bad.fail_start = UnreachableError("not there")
+    bad.fail_close = RuntimeError("stuck")
+    cascade = build(bad, good)
+    await cascade.start()
+    await cascade.close()
+    assert good.closed
+
+
+async def test_default_configuration_has_the_rules_alone(
+    catalogue: Catalogue, robots: tuple[RobotInfo, ...], site: Site
+) -> None:
+    """With no model and no server configured, plain orders are planned by rules against roster and site."""
+    cascade = Decomposer(LlmConfig(), catalogue)
+    assert cascade.tiers == ("rules",)
+    await cascade.start()
+    try:
+        outcome = await cascade.plan(
+            PlanContext(instruction="Rover_1: go to the shelf and pick the box", robots=robots, site=site)
+        )
+        assert [each.skill for each in outcome.plan.subtasks] == ["goto", "pick"]
+        for text, said in (
+            ("Rover_7: go to the shelf", "there is no robot rover_7"),
+            ("Rover_1: go to the moon", "there is no place moon"),
+            ("Drone_1 take off to 90 m", "limit of 30 m"),
+            ("colourless green ideas", "not understood"),
+            ("asdf", "not understood"),
+            ("If the door is open, go to the shelf", "below 0.80"),
+        ):
+            with pytest.raises(PlanError, match=said) as caught:
+                await cascade.plan(PlanContext(instruction=text, robots=robots, site=site))
+            assert caught.value.remedy
+            assert caught.value.problems
+    finally:
+        await cascade.close()
+
+
+async def test_rules_never_carry_out_half_an_order(catalogue: Catalogue) -> None:
+    """A plan by rules below their threshold is refused even when nothing else answers."""
+    slot = Slot(planner=RulesTier(catalogue), deadline_s=5, min_confidence=0.8, fallback=False)
+    with pytest.raises(PlanError, match="not understood"):
+        await Decomposer(LlmConfig(), catalogue, slots=[slot]).plan(
+            PlanContext(instruction="Go to the shelf. Abracadabra simsalabim hocus pocus.")
+        )
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"tiers": ("oracle",)},
+        {"tiers": ()},
+        {"tiers": ("rules", "rules")},
+        {"rules_min_confidence": 2.0},
+        {"upstream_deadline_s": 0.0},
+        {"upstream_retries": 50},
+        {"upstream_url": "ftp://x", "upstream_model": "m"},
+        {"upstream_url": "http://x"},
+        {"upstream_key_file": "/nowhere/key"},
+        {"local_max_tokens": 1},
+    ],
+)
+def test_wrong_configuration_is_named(config: dict[str, object], catalogue: Catalogue) -> None:
+    """A wrong setting is a ConfigError that names the key and what to write instead."""
+    with pytest.raises(ConfigError, match=r"llm") as caught:
+        Decomposer(LlmConfig(**config), catalogue)  # type: ignore[arg-type]
+    assert caught.value.remedy
+
+
+def test_importing_the_room_is_cheap() -> None:
+    """Neither the model library nor the HTTP client is loaded by importing the planner."""
+    code = (
+        "import sys, appliance.llm.cascade, appliance.llm.local, appliance.llm.upstream;"
+        "print([name for name in ('onnxruntime_genai', 'onnxruntime', 'httpx', 'numpy') if name in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert found.stdout.strip() == "[]"
