@@ -77,6 +77,7 @@ class Session:
         self._outbox = Outbox(messages=config.queue_messages, payload_bytes=config.queue_bytes)
         self._answering: set[asyncio.Task[None]] = set()
         self._asking: set[asyncio.Future[bytes]] = set()
+        self._tokens: set[zenoh.LivelinessToken] = set()
         self._closed = False
 
     @classmethod
@@ -336,7 +337,14 @@ class Session:
     def declare_alive(self, key: str) -> Closer:
         """Show a liveliness token until closed, or until this process dies."""
         token = self._raw.liveliness().declare_token(key)
-        return Closer(token.undeclare)
+
+        def end() -> None:
+            self._tokens.discard(token)
+            token.undeclare()
+
+        # Kept here: unlike a subscription, a token that nobody holds is taken back by the garbage collector.
+        self._tokens.add(token)
+        return Closer(end)
 
     async def alive_now(self, expr: str, *, timeout_s: float = 1.0) -> list[str]:
         """Return the keys of the tokens that are there now; those that could be had in time."""

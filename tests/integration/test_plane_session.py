@@ -1,6 +1,7 @@
 """Session and RPC between real Zenoh sessions on loopback: delivery, errors, and every kind of bad input."""
 
 import asyncio
+import gc
 import itertools
 import json
 import socket
@@ -292,6 +293,19 @@ async def test_tokens_are_seen_by_those_who_come_later(pair: tuple[Session, Sess
     await _until(lambda: seen == [(key, True)])
     token.close()
     await _until(lambda: seen == [(key, True), (key, False)])
+
+
+async def test_a_token_lasts_though_nobody_holds_it(pair: tuple[Session, Session]) -> None:
+    """A token whose Closer was thrown away stays until the session ends."""
+    one, other = pair
+    one.declare_alive(one.keys.alive("a"))
+    gc.collect()
+    seen: list[bool] = []
+    other.watch_alive(other.keys.alive(), lambda _, alive: seen.append(alive))
+    await _until(lambda: seen)
+    assert await other.alive_now(other.keys.alive()) == [one.keys.alive("a")]
+    await one.close()
+    await _until(lambda: seen == [True, False])
 
 
 async def test_a_port_in_use_is_named(free_port: int) -> None:
