@@ -1,0 +1,188 @@
+"""How good plans are: a set of instructions with gold plans, put to the cascade, scored by the set's own `score.py`.
+
+The scorer is loaded from beside the cases, since figures are only comparable when counted by the same program. Each
+case's roster gets every ability of the catalogue (the set names robots, not what they can do), and no site. Two
+figures stand side by side: `all`, what the tiers propose for every case whatever their confidence, and `taken`, the
+cases in which a plan was sure enough to be carried out. The second must be high, and the first minus it is what goes
+to a better tier or back to the operator.
+"""
+
+import importlib.util
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from appliance.errors import NotFoundError, PayloadError, PlanError
+from appliance.llm.cascade import Decomposer
+from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.model import Plan, RobotInfo
+from appliance.skills.catalogue import Catalogue, load_catalogue
+
+Progress = Callable[[str], None]
+_REPOSITORY = Path(__file__).resolve().parents[2]
+FIGURES = ("decomposition", "parallel_recall", "subtask_f1", "param_f1", "exact", "domain", "valid")
+
+
+class Case(Struct, frozen=True):
+    """One line of the set; what else it holds is the scorer's."""
+
+    id: str
+    instruction: str
+    gold: dict[str, Any]
+    robots: tuple[str, ...] | None = None
+
+
+def default_cases() -> Path:
+    """Return where the development set is expected: `$SWIFTBOT_SHARED` or `../shared`, `decomposition/dev.jsonl`."""
+    named = os.environ.get("SWIFTBOT_SHARED", "")
+    return (Path(named) if named else _REPOSITORY.parent / "shared") / "decomposition" / "dev.jsonl"
+
+
+async def run(
+    cases: Path | None = None,
+    *,
+    config: LlmConfig | None = None,
+    limit: int = 0,
+    progress: Progress = lambda _: None,
+) -> dict[str, Any]:
+    """Plan every case and score the plans.
+
+    Args:
+        cases: JSONL file of cases, with `score.py` beside it; by default the development set.
+        config: tiers to measure; by default the rules alone. Thresholds count for `taken` only.
+        limit: use the first so many cases; 0 for all.
+        progress: told each case whose plan is not exact.
+
+    Returns:
+        `all` and `taken`: percent by figure and the number of cases; `by_domain`: decomposition by domain;
+        `latency_ms`: p50 and p99; `tiers`: how often each tier's plan was used.
+
+    Raises:
+        NotFoundError: the cases or their scorer are not there.
+        PayloadError: a line is no case.
+    """
+    path = cases or default_cases()
+    found = _read(path)[: limit or None]
+    score = _scorer(path.parent / "score.py")
+    wanted = config or LlmConfig(tiers=("rules",))
+    catalogue = load_catalogue()
+    # Whatever its confidence: thresholds are applied below, to tell apart what would have been taken.
+    asking = msgspec.structs.replace(
+        wanted,
+        require_implemented=False,
+        local_min_confidence=0.0,
+        upstream_min_confidence=0.0,
+        rules_min_confidence=0.0,
+    )
+    least = {
+        "local": wanted.local_min_confidence,
+        "upstream": wanted.upstream_min_confidence,
+        "rules": wanted.rules_min_confidence,
+    }
+    decomposer = Decomposer(asking, catalogue)
+    await decomposer.start()
+    rows: list[dict[str, Any]] = []
+    taken: list[dict[str, Any]] = []
+    domains: dict[str, list[dict[str, Any]]] = {}
+    latency: list[float] = []
+    tiers: dict[str, int] = {}
+    try:
+        for case in found:
+            plan = await _plan(decomposer, case, catalogue)
+            row = score.score_case(msgspec.to_builtins(case), _prediction(plan))
+            rows.append(row)
+            domains.setdefault(str(case.gold.get("domain")), []).append(row)
+            if plan is None:
+                progress(f"{case.id}: no plan")
+                continue
+            latency.append(plan.latency_ms)
+            tiers[plan.tier.value] = tiers.get(plan.tier.value, 0) + 1
+            if plan.confidence >= least[plan.tier.value]:
+                taken.append(row)
+            if not row["exact"]:
+                progress(f"{case.id}: confidence {plan.confidence:.2f}, decomposition {row['decomposition']:.2f}")
+    finally:
+        await decomposer.close()
+    latency.sort()
+    return {
+        "all": _average(rows),
+        "taken": _average(taken),
+        "by_domain": {name: _average(each)["decomposition"] for name, each in sorted(domains.items())},
+        "latency_ms": {"p50": _at(latency, 0.5), "p99": _at(latency, 0.99)},
+        "tiers": tiers,
+    }
+
+
+async def _plan(decomposer: Decomposer, case: Case, catalogue: Catalogue) -> Plan | None:
+    robots = None if case.robots is None else tuple(_robot(name, catalogue) for name in case.robots)
+    try:
+        return (await decomposer.plan(PlanContext(instruction=case.instruction, robots=robots))).plan
+    except PlanError:
+        return None
+
+
+def _robot(name: str, catalogue: Catalogue) -> RobotInfo:
+    uses = tuple(sorted({use for skill in catalogue.skills.values() for use in skill.uses}))
+    verbs = tuple(sorted({verb for skill in catalogue.skills.values() for verb in skill.verbs}))
+    return RobotInfo(id=name, kind="zenoh", uses=uses, verbs=verbs, flies=True)
+
+
+def _prediction(plan: Plan | None) -> dict[str, Any]:
+    if plan is None:
+        return {}
+    subtasks = [
+        {"id": each.id, "skill": each.skill, "robot": each.robot, "params": each.params, "after": list(each.after)}
+        for each in plan.subtasks
+    ]
+    return {"domain": plan.domain, "subtasks": subtasks}
+
+
+def _average(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    figures: dict[str, Any] = {"cases": len(rows)}
+    for name in FIGURES:
+        values = [float(row[name]) for row in rows if row[name] is not None]
+        figures[name] = round(100 * sum(values) / len(values), 1) if values else None
+    return figures
+
+
+def _at(ordered: Sequence[float], part: float) -> float | None:
+    return round(ordered[min(len(ordered) - 1, int(len(ordered) * part))], 3) if ordered else None
+
+
+def _read(path: Path) -> list[Case]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise NotFoundError(
+            f"no cases at {path}: {error.strerror}", remedy="name a JSONL file of cases, or set SWIFTBOT_SHARED"
+        ) from error
+    found: list[Case] = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                found.append(msgspec.json.decode(line, type=Case))
+            except msgspec.DecodeError as error:
+                raise PayloadError(f"{path}:{number} is no case: {error}", remedy="see the set's README") from error
+    return found
+
+
+def _scorer(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("decomposition_score", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise NotFoundError(f"no scorer at {path}", remedy="keep score.py beside the cases")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+if __name__ == "__main__":
+    import asyncio
+    import sys
+
+    print(json.dumps(asyncio.run(run(progress=lambda text: print(text, file=sys.stderr))), indent=1))
