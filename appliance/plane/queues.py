@@ -19,10 +19,22 @@ _TURN = 256
 
 
 class Inbox:
-    """Calls from any thread to the event loop's thread, in order; one wake-up however many wait."""
+    """Calls from any thread to the event loop's thread, in order; one wake-up however many wait.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, *, messages: int, payload_bytes: int) -> None:
+    `on_dropped` is told on the loop's thread how many were dropped, once the burst is over.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        messages: int,
+        payload_bytes: int,
+        on_dropped: Callable[[int], None] | None = None,
+    ) -> None:
         self._loop = loop
+        self._on_dropped = on_dropped
+        self._told = 0
         self._most, self._most_bytes = messages, payload_bytes
         self._waiting: deque[tuple[Callable[[], None], int]] = deque()
         self._bytes = 0
@@ -57,14 +69,20 @@ class Inbox:
             with self._lock:
                 if not self._waiting:
                     self._woken = False
-                    return
+                    break
                 call, size = self._waiting.popleft()
                 self._bytes -= size
             try:
                 call()
             except Exception:  # supervision boundary: one receiver's defect must not end the others' deliveries
                 log.exception("a receiver failed")
-        self._loop.call_soon(self._deliver)
+        else:
+            self._loop.call_soon(self._deliver)
+            return
+        dropped = self.dropped
+        if dropped > self._told and self._on_dropped is not None:
+            self._on_dropped(dropped - self._told)
+        self._told = dropped
 
     def close(self) -> None:
         """Forget what waits and take no more."""

@@ -73,7 +73,12 @@ class Session:
         self.refused: dict[str, int] = {}
         self._raw = raw
         self._loop = loop
-        self._inbox = Inbox(loop, messages=config.queue_messages, payload_bytes=config.queue_bytes)
+        self._inbox = Inbox(
+            loop,
+            messages=config.queue_messages,
+            payload_bytes=config.queue_bytes,
+            on_dropped=lambda count: self.refuse("incoming queue full", count=count),
+        )
         self._outbox = Outbox(messages=config.queue_messages, payload_bytes=config.queue_bytes)
         self._answering: set[asyncio.Task[None]] = set()
         self._asking: set[asyncio.Future[bytes]] = set()
@@ -386,13 +391,13 @@ class Session:
 
     # --- bad input, end ---------------------------------------------------------------------------------------
 
-    def refuse(self, what: str, **fields: Any) -> None:
-        """Count bad input; logged the first ten times and then at powers of two, so a flood does not fill the log."""
-        count = self.refused.get(what, 0) + 1
-        self.refused[what] = count
-        if count <= 10 or count & (count - 1) == 0:
+    def refuse(self, what: str, *, count: int = 1, **fields: Any) -> None:
+        """Count bad input; logged the first ten times, then at powers of two: a flood does not fill the log."""
+        before = self.refused.get(what, 0)
+        total = self.refused[what] = before + count
+        if total <= 10 or before.bit_length() != total.bit_length():
             fields = {key: value[:300] if isinstance(value, str) else value for key, value in fields.items()}
-            log.warning("refused", what=what, count=count, **fields)
+            log.warning("refused", what=what, count=total, **fields)
 
     def _name(self, expr: str) -> str:
         return expr.removeprefix(f"{self.keys.root}/")

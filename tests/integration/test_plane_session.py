@@ -5,6 +5,7 @@ import gc
 import itertools
 import json
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
 
 import msgspec
@@ -96,6 +97,28 @@ async def test_bad_facts_are_counted_and_dropped(pair: tuple[Session, Session]) 
     await _until(lambda: len(seen) == 3)
     assert [value is None for _, value in seen] == [False, False, True]
     assert other.refused == {"malformed gw/*/log": len(bad), "oversize gw/*/log": 1}
+
+
+async def test_a_flood_is_bounded_and_counted(free_port: int) -> None:
+    """What comes in faster than the loop takes it is dropped beyond the bound and counted; afterwards all is well."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    one = await Session.open(PlaneConfig(listen=(endpoint,), queue_messages=100), "f")
+    other = await Session.open(PlaneConfig(connect=(endpoint,)), "f")
+    seen: list[Message] = []
+    one.subscribe("swiftbot/f/x", seen.append)
+    await _heard(other, one)
+    for _ in range(5000):
+        other.put("swiftbot/f/x", b"x" * 100)
+    while other._outbox._waiting:
+        time.sleep(0.01)  # noqa: ASYNC251 - the loop must not turn: it is what is overrun here
+    time.sleep(0.2)  # noqa: ASYNC251
+    assert len(one._inbox._waiting) == 100
+    await _until(lambda: one.refused.get("incoming queue full", 0) + len(seen) == 5000)
+    seen.clear()
+    other.put("swiftbot/f/x", b"after")
+    await _until(lambda: [message.payload for message in seen] == [b"after"])
+    await one.close()
+    await other.close()
 
 
 async def test_an_oversize_put_is_refused_here(pair: tuple[Session, Session]) -> None:

@@ -35,7 +35,8 @@ async def test_calls_arrive_in_order_on_the_loop() -> None:
 
 async def test_a_full_inbox_drops_and_counts() -> None:
     """Beyond its bounds an inbox drops; what must arrive (ends of queries) still does."""
-    inbox = Inbox(asyncio.get_running_loop(), messages=3, payload_bytes=100)
+    told: list[int] = []
+    inbox = Inbox(asyncio.get_running_loop(), messages=3, payload_bytes=100, on_dropped=told.append)
     seen: list[str] = []
     assert inbox.post(partial(seen.append, "a"), 60)
     assert not inbox.post(partial(seen.append, "too large"), 60)
@@ -47,6 +48,7 @@ async def test_a_full_inbox_drops_and_counts() -> None:
     await asyncio.sleep(0)
     assert seen == ["a", "b", "c", "end"]
     assert inbox.dropped == 2
+    assert told == [2]
     assert inbox.post(partial(seen.append, "again"), 60)
     inbox.close()
     assert not inbox.post(partial(seen.append, "closed"))
