@@ -105,17 +105,20 @@ class UpstreamTier:
 
     async def _ask(self, chat: list[dict[str, str]]) -> _Completion:
         tries = 0
+        form = self._format
         while True:
             try:
-                status, body = await self._post(chat)
+                status, body = await self._post(chat, _FORMATS[form])
             except (UnreachableError, DeadlineError) as error:
                 failure: SwiftbotError = error
             else:
                 if status == 200:
+                    # Remembered only now: a request refused for another reason must not cost the schema for good.
+                    self._format = form
                     return _decode(body)
-                if status in (400, 422) and self._format < len(_FORMATS) - 1:
-                    log.info("upstream refuses the response format", refused=_FORMATS[self._format], status=status)
-                    self._format += 1
+                if status in (400, 422) and form < len(_FORMATS) - 1:
+                    log.info("upstream refuses the request", response_format=_FORMATS[form], status=status)
+                    form += 1
                     continue
                 failure = self._refusal(status, body)
                 if status != 429 and status < 500:
@@ -125,14 +128,14 @@ class UpstreamTier:
             tries += 1
             await asyncio.sleep(_PAUSE_S * 2 ** (tries - 1))
 
-    async def _post(self, chat: list[dict[str, str]]) -> tuple[int, bytes]:
+    async def _post(self, chat: list[dict[str, str]], form: str) -> tuple[int, bytes]:
         import httpx  # noqa: PLC0415 - loading it costs memory that a gateway without upstream keeps
 
         if self._client is None:
             limit = self._config.upstream_deadline_s
             self._client = httpx.AsyncClient(timeout=httpx.Timeout(limit, connect=min(_CONNECT_S, limit)))
         headers = {"content-type": "application/json", **self._key()}
-        content = msgspec.json.encode(self._body(chat))
+        content = msgspec.json.encode(self._body(chat, form))
         body = bytearray()
         try:
             async with self._client.stream("POST", self._url, content=content, headers=headers) as response:
@@ -172,15 +175,11 @@ class UpstreamTier:
             )
         return {"authorization": f"Bearer {key}"} if key else {}
 
-    def _body(self, chat: list[dict[str, str]]) -> dict[str, Any]:
-        body: dict[str, Any] = {
-            "model": self._config.upstream_model,
-            "messages": chat,
-            "temperature": 0,
-            "max_tokens": self._config.upstream_max_tokens,
-            "stream": False,
-        }
-        form = _FORMATS[self._format]
+    def _body(self, chat: list[dict[str, str]], form: str) -> dict[str, Any]:
+        body: dict[str, Any] = {"model": self._config.upstream_model, "messages": chat, "stream": False}
+        if form != "none":
+            # Some servers refuse these too; the last resort asks for nothing that can be refused.
+            body |= {"temperature": 0, "max_tokens": self._config.upstream_max_tokens}
         if form == "json_schema":
             # Not strict: strict servers take no optional properties, and a plan leaves out what was not said.
             schema = {"name": "plan", "strict": False, "schema": plan_schema(self._catalogue)}

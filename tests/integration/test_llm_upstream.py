@@ -156,6 +156,20 @@ async def test_refused_schema_falls_back_and_is_remembered(server: Server) -> No
     assert formats == ["json_schema", "json_object", "none", "none"]
 
 
+async def test_refusal_for_another_reason_does_not_cost_the_schema(server: Server) -> None:
+    """A request that is refused in every form is an error, and the next one is asked with the schema again."""
+    server.answers = [(400, b"context too long")]
+    tier = UpstreamTier(config(server), CATALOGUE)
+    try:
+        with pytest.raises(PayloadError, match="context too long"):
+            await tier.propose(ASK)
+        server.answers = [completion(PLAN)]
+        await tier.propose(ASK)
+    finally:
+        await tier.close()
+    assert server.asked[-1]["response_format"]["type"] == "json_schema"
+
+
 async def test_failing_server_is_tried_again_within_bounds(server: Server) -> None:
     """One 503 is tried again and forgotten; a server that keeps failing is an UnreachableError that says so."""
     server.answers = [(503, b"warming up"), completion(PLAN)]

@@ -63,7 +63,7 @@ class Who(Struct):
 
     robots: list[str] = field(default_factory=list[str])
     kind: str = "elided"
-    """named, all, several, one, first, other, pronoun, elided"""
+    """named, all, several, one, the, first, other, pronoun, elided"""
 
 
 class Clause(Struct):
@@ -241,6 +241,7 @@ class Reader:
             (names.SEVERAL, "several"),
             (names.ALL, "all"),
             (names.ONE, "one"),
+            (names.THE, "the"),
             (names.OTHER, "other"),
             (names.FIRST, "first"),
             (names.PRONOUN, "pronoun"),
@@ -260,6 +261,11 @@ class Reader:
                     robots = [f"any{index + 1}" for index in range(int(lx.number(groups["n"]) or 2))]
                 elif kind == "one":
                     robots = ["any"]
+                elif kind == "the":
+                    # Definite, so the one of its kind; else the one spoken of, else whichever.
+                    alike = self.names.everyone(groups["kind"])
+                    spoken = [name for name in self.mentions.robots if name in alike]
+                    robots = alike if len(alike) == 1 and alike != ["all"] else spoken[:1] or ["any"]
                 found.append((Who(robots, kind), text[match.end() :]))
         return found
 
@@ -347,7 +353,7 @@ class Reader:
         """Return how many words of the slots look as if more had been meant than one noun phrase."""
         lost = 0.0
         for step in steps:
-            for key, value in step.params.items():
+            for key, value in [*step.params.items(), ("at", step.at)]:
                 if not isinstance(value, str) or key in _FREE_TEXT:
                     continue
                 count = len(value.split())

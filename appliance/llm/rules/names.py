@@ -40,6 +40,9 @@ SEVERAL = re.compile(
     rf"(?:the )?(?P<n>two|three|four|five|six|2|3|4|5|6) (?:different |free |available )?(?P<kind>{KIND})\b",
     re.IGNORECASE,
 )
+THE = re.compile(
+    r"the (?P<kind>robot|drone|rover|uav|ugv|copter|quadcopter|bot|amr|agv|arm)\b(?! (?:\d|[A-Z]\b))", re.IGNORECASE
+)
 OTHER = re.compile(rf"(?:the other|another|the second)(?: (?:{KIND}))?\b", re.IGNORECASE)
 FIRST = re.compile(rf"(?:one|the first)(?: (?:{KIND}))?\b", re.IGNORECASE)
 PRONOUN = re.compile(r"(?:they|it|he|she|you|we|who|both|them)\b", re.IGNORECASE)

@@ -82,6 +82,8 @@ class Parser:
         }
         if "any1" in labels and "any2" not in labels:
             subtasks = tuple(renamed(each, "any1", "any") for each in subtasks)
+        elif "any2" in labels and not labels & {"any", "any1"}:
+            subtasks = tuple(renamed(each, "any2", "any") for each in subtasks)
         elif "any2" in labels and "any" in labels:
             subtasks = tuple(renamed(each, "any", "any1") for each in subtasks)
         confidence = max(0.0, 1.0 - self._lost / self._said) if self._said and subtasks else 0.0
@@ -359,7 +361,15 @@ class Parser:
             if clause is not None:
                 clause.prefix = previous.prefix
             return clause
-        if previous.who.kind not in ("named", "one", "first", "other", "all"):
+        if re.match(r"(?:the|an?) .+ (?:from|at|in|on|to|into|onto) ", clean(text), re.IGNORECASE):
+            # "fetch the red box from dock 3 and the blue box from dock 1"
+            clause = self._reader.read(f"{previous.prefix} {clean(text)}", speaking_to=self._to)
+            skills = [step.skill for step in previous.steps]
+            if clause and skills[-1] in ("pick", "place") and [step.skill for step in clause.steps] == skills:
+                clause.prefix = previous.prefix
+                return clause
+            return None
+        if previous.who.kind not in ("named", "one", "first", "other", "all", "the"):
             return None
         found = self._names.leading(clean(text))
         if found is None or len(found[0]) != 1 or not found[1].strip():
@@ -383,7 +393,11 @@ class Parser:
         sentence = self._graph.snapshot() if start is None else start
         pending: list[set[int]] = []
         chunks = self._chunks(text)
+        told = False
         for index, (kind, piece) in enumerate(chunks):
+            if told:
+                told = False
+                continue
             if kind in ("when", "if"):
                 if halves := self._halves(piece):
                     self._condition(kind, halves[0])
@@ -405,6 +419,12 @@ class Parser:
             if clause is None:
                 self._lose(said, len(said.split()))
                 continue
+            if [each for each, _ in chunks[index + 1 : index + 2]] == ["after"] and kind != "after":
+                done = self._afterwards(kind, said, clause, chunks[index + 1][1], start if not pending else None)
+                if done is not None:
+                    pending.append(done)
+                    told = True
+                    continue
             self._lost += clause.lost
             anew = not pending or clause.who.kind not in ("elided", "pronoun")
             how = "beside" if self._all_beside and pending and kind == "list" else kind
@@ -412,6 +432,26 @@ class Parser:
             if kind == "after" and pending:
                 self._graph.order(ends, pending[-1])
             pending.append(firsts)
+
+    def _afterwards(self, kind: str, said: str, clause: Clause, before: str, start: Snapshot | None) -> set[int] | None:
+        """Read "A after B" in the order in which it happens; None when B is no clause.
+
+        B is told with A's words ("places the box after fetching it"), so A is remembered first, then B is added.
+        """
+        speaking_to, last = self._to, self._last
+        self._to = self._doers(clause.who)
+        self._remember(clause)
+        if (first := self._reader.read(before, speaking_to=self._to)) is None:
+            self._to, self._last = speaking_to, last
+            return None
+        doers = self._to
+        _, ends = self._emit(kind, first, start)
+        self._to = doers
+        clause = self._reader.read(said, speaking_to=doers) or clause
+        self._lost += first.lost + clause.lost
+        firsts, _ = self._emit("list", clause, None)
+        self._graph.order(ends, firsts)
+        return firsts
 
     def _earlier(self, text: str) -> None:
         """Read "Close the clamp first", said after what it comes before."""
@@ -468,7 +508,7 @@ class Parser:
     def _doers(self, who: Who) -> list[str]:
         """Return the robots that a subject means now."""
         mentions = self._reader.mentions
-        if who.kind in ("named", "all", "several"):
+        if who.kind in ("named", "all", "several", "the"):
             return who.robots
         if who.kind == "one":
             return ["any"]

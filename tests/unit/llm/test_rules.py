@@ -167,6 +167,31 @@ CASES: list[tuple[str, tuple[str, ...], list[str]]] = [
         ["s1 count any1 target=sheep", "s2 count any2 target=goats", "s3 report - to=ann <s1 <s2"],
     ),
     (
+        "Fetch the red box from dock 3 and the blue box from dock 1",
+        (),
+        [
+            "s1 goto any place=dock 3",
+            "s2 pick any object=red box <s1",
+            "s3 goto any place=dock 1 <s2",
+            "s4 pick any object=blue box <s3",
+        ],
+    ),
+    (
+        "Rover_1 places the red box on the conveyor after fetching it from dock 3",
+        (),
+        [
+            "s1 goto rover_1 place=dock 3",
+            "s2 pick rover_1 object=red box <s1",
+            "s3 place rover_1 object=red box at=conveyor <s2",
+        ],
+    ),
+    (
+        "The rover goes to dock 1 while the drone films the aisle",
+        ("drone_1", "rover_1"),
+        ["s1 goto rover_1 place=dock 1", "s2 record_video drone_1 target=aisle"],
+    ),
+    ("DRONE_1 TAKE OFF TO 10 M AND LAND", ("drone_1",), ["s1 takeoff drone_1 altitude_m=10", "s2 land drone_1 <s1"]),
+    (
         "Rover_1 and drone_1 meet at goal 1",
         ("drone_1", "rover_1"),
         ["s1 rendezvous rover_1 robots=['rover_1', 'drone_1'] place=goal 1"],
