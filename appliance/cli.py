@@ -562,6 +562,21 @@ def bench_record(*, messages: int = 50_000, rounds: int = 3, as_json: Json = Fal
     return 0
 
 
+@bench_app.command(name="plan")
+def bench_plan(*, cases: Path | None = None, limit: int = 0, as_json: Json = False) -> int:
+    """Plans: how good the rules' plans are on a set of instructions with gold plans.
+
+    Args:
+        cases: JSONL file of cases with score.py beside it; by default the development set.
+        limit: Use the first so many cases; 0 for all.
+    """
+    from appliance.bench.plan import run as bench
+
+    result = asyncio.run(bench(cases, limit=limit, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: run a command and end with its exit code."""
     # Commands speak for themselves; daemons set up their own logging when they start.

@@ -83,6 +83,7 @@ def check(config: GatewayConfig, source: str) -> None:
         check_name(config.fleet, "fleet")
         config.robots.check()
         config.record.check()
+        config.llm.check()
     except (PayloadError, ConfigError) as error:
         raise ConfigError(f"{source}: {error.message}", remedy=error.remedy) from error
     if config.log_level not in ("debug", "info", "warning", "error"):

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import itertools
 import os
+import signal
 import sys
 import time
 from collections import deque
@@ -208,6 +209,10 @@ class LocalTier:
         return await self._death(process)
 
     async def _death(self, process: asyncio.subprocess.Process) -> SwiftbotError:
+        # Its output has ended, so it is dead or about to be; what it ended with is the reason.
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_STOP_S):
+                await process.wait()
         await self._end(process)
         status = process.returncode or 0
         how = f"by signal {-status}" if status < 0 else f"with status {status}"
@@ -235,8 +240,9 @@ class LocalTier:
             async with asyncio.timeout(0 if self._turn.locked() else _STOP_S):
                 await process.wait()
         except TimeoutError:
+            # Not process.kill(): that polls, which takes the exit status away from the loop's own watcher.
             with contextlib.suppress(ProcessLookupError):
-                process.kill()
+                os.kill(process.pid, signal.SIGKILL)
             await process.wait()
 
 
