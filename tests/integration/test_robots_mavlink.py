@@ -253,7 +253,7 @@ async def test_bad_frames_are_counted_and_the_stream_goes_on(open_yard: Open) ->
     bad[12] ^= 0xFF
     unknown = bytearray(good)
     unknown[8] = 0xF0
-    position = Codec(60, 1).pack(make("SYSTEM_TIME", time_unix_usec=1, time_boot_ms=1))
+    position = Codec(61, 1).pack(make("SYSTEM_TIME", time_unix_usec=1, time_boot_ms=1))
     station = Codec(255, 190).pack(
         make("HEARTBEAT", type=6, autopilot=8, base_mode=0, custom_mode=0, system_status=4, mavlink_version=3)
     )

@@ -7,6 +7,7 @@ commands, and puts every frame of it on the plane for the recorder. It takes no 
 
 import asyncio
 import contextlib
+from collections import Counter
 from collections.abc import Callable
 
 import structlog
@@ -70,6 +71,8 @@ class Station:
         self.refused = refused
         self._endpoints: list[Endpoint] = []
         self._vehicles: dict[str, _Attached] = {}
+        self._early: Counter[tuple[int, int]] = Counter()
+        """Frames by system before its heartbeat; there are 255 systems a link."""
         self._by_source: dict[tuple[int, int], _Attached] = {}
         self._others: set[str] = set()
         self._watch: Closer | None = None
@@ -155,11 +158,15 @@ class Station:
             return None
         if not is_autopilot(frame):
             self._count("unknown_system")
+            self._early[index, frame.system] += 1
             return None
         if name in self._vehicles or name in self._others:
             self._count("name_conflict")
             log.warning("vehicle refused: its name is taken", robot=name, system=frame.system)
             return None
+        # What it sent before its first heartbeat was not a stranger's.
+        if early := self._early.pop((index, frame.system), 0):
+            self.refused["unknown_system"] -= early
         each = self._attach(index, name, address)
         self._by_source[index, frame.system] = each
         return each
