@@ -106,6 +106,11 @@ class Reader:
             return self.mentions.thing or self.mentions.place or low
         return low
 
+    def cargo(self, text: str) -> str:
+        """Resolve what is put down or handed over: "it" is the thing held, whatever was spoken of since."""
+        pronoun = lx.noun(text) in ("it", "them", "this", "that", "these", "those")
+        return self.mentions.held if pronoun and self.mentions.held else self.thing(text)
+
     def place(self, text: str) -> str:
         """Resolve a place; "there" is the last one."""
         low = lx.noun(text)

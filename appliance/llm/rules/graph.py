@@ -248,6 +248,8 @@ class Mentions(Struct):
     """What was spoken of last, for pronouns."""
 
     thing: str = ""
+    held: str = ""
+    """What was picked last and not put down or given away since."""
     place: str = ""
     person: str = ""
     model: str = ""

@@ -31,7 +31,7 @@ def _deliver(objects: str, source: str | None, to: str, scope: Scope, *, held: b
     inside = re.fullmatch(r"(?P<p>.+?) (?:in|at) (?P<where>.+)", to, re.IGNORECASE)
     steps: list[Step] = []
     for each in lx.things(objects):
-        thing = scope.thing(each)
+        thing = scope.cargo(each)
         if not held:
             steps.append(Step("pick", {"object": thing}, at=_at(source, scope), fetch=lx.noun(each) in ("it", "them")))
         if (robot := scope.robot(to)) is not None:
@@ -80,7 +80,7 @@ def _put(match: Match, scope: Scope) -> list[Step]:
     target = match["b"]
     steps: list[Step] = []
     for each in lx.things(match["o"]):
-        step = Step("place", {"object": scope.thing(each), "at": scope.place(target)}, fetch=True)
+        step = Step("place", {"object": scope.cargo(each), "at": scope.place(target)}, fetch=True)
         if prep == "at" or scope.known_place(target):
             step.at = step.params["at"]
         steps.append(step)
@@ -97,8 +97,8 @@ def _hand(match: Match, scope: Scope) -> list[Step] | None:
     to = match["to"]
     robot = scope.robot(to)
     if robot is not None:
-        return [Step("handover", {"object": scope.thing(match["o"]), "to": robot})]
-    return [Step("give", {"object": scope.thing(match["o"]), "to": scope.person(to)})]
+        return [Step("handover", {"object": scope.cargo(match["o"]), "to": robot})]
+    return [Step("give", {"object": scope.cargo(match["o"]), "to": scope.person(to)})]
 
 
 PATTERNS.on("hand pass give", r"(?: over)? (?P<o>.+?)(?: over)? to (?P<to>.+)")(_hand)

@@ -404,6 +404,10 @@ class Parser(Conditions):
             for key in ("object", "target", "asset", "source"):
                 if value := step.params.get(key):
                     mentions.thing = str(value)
+            if step.skill == "pick" or step.fetch:
+                mentions.held = str(step.params.get("object", ""))
+            if step.skill in ("place", "give", "handover"):
+                mentions.held = ""
             for key in ("place", "area", "station"):
                 if value := step.params.get(key):
                     mentions.place = str(value)

@@ -30,6 +30,10 @@ class Scope(Protocol):
         """Resolve an object, pronouns included."""
         ...
 
+    def cargo(self, text: str) -> str:
+        """Resolve what is put down or handed over, "it" being the thing held."""
+        ...
+
     def place(self, text: str) -> str:
         """Resolve a place; "there" is the last one."""
         ...

@@ -43,6 +43,16 @@ TWO_ROBOTS = (
 )
 CASES: list[tuple[str, tuple[str, ...], list[str]]] = [
     (
+        "Rover_1: go to dock 3, pick the red box, then go to dock 2 and place it at dock 2",
+        (),
+        [
+            "s1 goto rover_1 place=dock 3",
+            "s2 pick rover_1 object=red box <s1",
+            "s3 goto rover_1 place=dock 2 <s2",
+            "s4 place rover_1 object=red box at=dock 2 <s3",
+        ],
+    ),
+    (
         "Robot_1 fetch the red box from dock 3 while Robot_2 films the aisle",
         (),
         ["s1 goto robot_1 place=dock 3", "s2 pick robot_1 object=red box <s1", "s3 record_video robot_2 target=aisle"],
