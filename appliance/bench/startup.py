@@ -6,6 +6,7 @@ in both cases is `started.at - entry of Pool.run`, both CLOCK_MONOTONIC of this 
 another gateway.
 """
 
+import asyncio
 import math
 import secrets
 import tempfile
@@ -23,7 +24,7 @@ from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunReq
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
-from appliance.skills.catalogue import load_catalogue
+from appliance.skills.catalogue import image_reference, load_catalogue
 
 WARM_UP_S = 60.0
 SKILL = "bench_nothing"
@@ -69,14 +70,16 @@ async def run(
         progress: told what is being measured.
 
     Returns:
-        For `cold` and `local`: count, p50, p90, p99, max in milliseconds; and `cold_over_local`, the ratio of the
-        medians.
+        For `podman_run`, `cold` and `local`: count, p50, p90, p99, max in milliseconds; and the ratios of the
+        medians to `local`.
 
     Raises:
         PrerequisiteError: Podman or the image is not there.
         PoolError: a run did not work.
     """
     config = config or PoolConfig()
+    progress(f"podman run: {cold} times {image}")
+    podman_ms = [await _podman_run(image_reference(image)) for _ in range(cold)]
     progress(f"cold: {cold} new containers of {image}")
     async with _pool(replace(config, mode="cold", floor={}), image) as pool:
         cold_ms = [await _startup(pool, image, number) for number in range(cold)]
@@ -85,10 +88,33 @@ async def run(
         await _warm(pool, image, 2)
         await _startup(pool, image, count)  # the first one pays for lazy imports on this side
         local_ms = [await _startup(pool, image, number) for number in range(count)]
-    result: dict[str, Any] = {"unit": "ms", "image": image, "cold": summary(cold_ms), "local": summary(local_ms)}
+    result: dict[str, Any] = {
+        "unit": "ms",
+        "image": image,
+        "podman_run": summary(podman_ms),
+        "cold": summary(cold_ms),
+        "local": summary(local_ms),
+    }
     if cold_ms and local_ms:
+        result["podman_run_over_local"] = round(result["podman_run"]["p50"] / result["local"]["p50"], 1)
         result["cold_over_local"] = round(result["cold"]["p50"] / result["local"]["p50"], 1)
     return result
+
+
+async def _podman_run(reference: str) -> float:
+    """What a user would do without a pool: `podman run` of the image, to the first line of a Python program."""
+    began_ns = time.monotonic_ns()
+    process = await asyncio.create_subprocess_exec(
+        "podman", "run", "--rm", "--network", "none", "--read-only", "--cap-drop", "all", reference,
+        "python3", "-c", "import time; print(time.monotonic_ns())",
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    told, problem = await process.communicate()
+    if process.returncode != 0:
+        raise PrerequisiteError(
+            f"podman run failed: {problem.decode(errors='replace').strip()[-300:]}", remedy="swiftbot doctor tells more"
+        )
+    return (int(told) - began_ns) / 1e6
 
 
 def write_skill(folder: Path, image: str) -> Path:
