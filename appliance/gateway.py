@@ -33,6 +33,7 @@ from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.remote import RemoteContainers
+from appliance.tasks.retention import Retention
 
 log = structlog.get_logger(__name__)
 
@@ -129,8 +130,8 @@ class Gateway:
         await self.manager.start()
         self._stack.push_async_callback(self.manager.stop)
         self._publish_status()
-        status = asyncio.create_task(self._keep_publishing(), name="status")
-        self._stack.callback(status.cancel)
+        for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
+            self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
 
     def _load(self) -> tuple[Catalogue, Site]:

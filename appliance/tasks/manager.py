@@ -230,7 +230,6 @@ class TaskManager:
         for task_id, driving in list(self._driving.items()):
             if not self.plane.dht.owns(task_key(task_id)):
                 driving.cancel()
-        finished: list[tuple[int, str, VersionVector]] = []
         for stored in await self.plane.dht.local("task/"):
             if stored.deleted or not self.plane.dht.owns(stored.key):
                 continue
@@ -239,14 +238,8 @@ class TaskManager:
             except msgspec.DecodeError as error:
                 log.warning("task record cannot be read", key=stored.key, reason=str(error))
                 continue
-            if record.state.final:
-                finished.append((record.updated_ns, stored.key, stored.version))
-            elif record.id not in self._drivers:
+            if not record.state.final and record.id not in self._drivers:
                 self._drive(record, stored.version)
-        finished.sort()
-        for _, key, version in finished[: max(0, len(finished) - self.config.keep_finished)]:
-            with contextlib.suppress(ConflictError):
-                await self.plane.dht.remove(key, expected=version)
 
     def _on_run_event(self, key: str, event: RunEvent | None) -> None:  # noqa: ARG002 - the event names its run
         if event is not None and (driver := self._drivers.get(event.task)):

@@ -1,0 +1,84 @@
+"""Forgets what nobody will ask for again: old finished tasks, and the effects of tasks that are forgotten.
+
+Each gateway looks only at the records it owns, so nothing is removed twice and nobody is in charge. A removed task
+is still in the logs.
+"""
+
+import asyncio
+import contextlib
+
+import msgspec
+import structlog
+
+from appliance.errors import ConflictError, SwiftbotError
+from appliance.model import TaskRecord
+from appliance.plane.dht import Record
+from appliance.plane.node import Plane
+from appliance.tasks.settings import TasksConfig
+
+log = structlog.get_logger(__name__)
+
+AT_ONCE = 200
+"""Removals in one round: a backlog must not crowd out the tasks that run."""
+
+
+def surplus(finished: list[tuple[int, str]], keep: int) -> list[str]:
+    """Keys of the oldest beyond `keep`; `finished` is (end, Unix nanoseconds; key)."""
+    newest_first = sorted(finished, reverse=True)
+    return [key for _, key in newest_first[max(0, keep) :]]
+
+
+class Retention:
+    """Forgets in the background; `run` never ends by itself."""
+
+    def __init__(self, plane: Plane, config: TasksConfig) -> None:
+        self._plane = plane
+        self._config = config
+
+    async def run(self) -> None:
+        """Look through the shard now and then."""
+        while True:
+            await asyncio.sleep(self._config.retention_s)
+            try:
+                removed = await self.round()
+            except SwiftbotError as error:
+                log.warning("forgetting is tried again later", reason=str(error))
+                continue
+            if removed:
+                log.info("old records forgotten", count=removed)
+
+    async def round(self) -> int:
+        """Remove what is due; returns how many records."""
+        due = [*await self._old_tasks(), *await self._orphaned_effects()]
+        for record in due[:AT_ONCE]:
+            with contextlib.suppress(ConflictError):
+                await self._plane.dht.remove(record.key, expected=record.version)
+        return len(due[:AT_ONCE])
+
+    async def _owned(self, prefix: str) -> dict[str, Record]:
+        return {each.key: each for each in await self._plane.dht.local(prefix) if self._plane.dht.owns(each.key)}
+
+    async def _old_tasks(self) -> list[Record]:
+        owned = await self._owned("task/")
+        finished: list[tuple[int, str]] = []
+        for key, stored in owned.items():
+            with contextlib.suppress(msgspec.DecodeError):
+                record = msgspec.json.decode(stored.value, type=TaskRecord)
+                if record.state.final:
+                    finished.append((record.updated_ns, key))
+        return [owned[key] for key in surplus(finished, self._config.keep_finished)]
+
+    async def _orphaned_effects(self) -> list[Record]:
+        """Effects whose task is gone. A task that runs is never gone, so its effects stay."""
+        owned = await self._owned("effect/")
+        orphaned: list[Record] = []
+        known: dict[str, bool] = {}
+        for key, stored in owned.items():
+            task = key.split("/")[1]
+            if task not in known:
+                if len(known) >= AT_ONCE:
+                    break
+                known[task] = await self._plane.dht.read(f"task/{task}") is not None
+            if not known[task]:
+                orphaned.append(stored)
+        return orphaned

@@ -1,0 +1,80 @@
+"""Forgetting old tasks: the newest stay, effects go only with their task."""
+
+from types import SimpleNamespace
+from typing import cast
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.model import TaskRecord, TaskState
+from appliance.plane.dht import Record
+from appliance.plane.node import Plane
+from appliance.tasks.retention import Retention, surplus
+from appliance.tasks.settings import TasksConfig
+
+pytestmark = pytest.mark.anyio
+
+
+class Records:
+    """A DHT of one gateway that owns what does not say otherwise."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, Record] = {}
+
+    def put(self, key: str, value: bytes = b"{}") -> None:
+        """Keep a record."""
+        self.kept[key] = Record(key=key, value=value, version={"gw-1": 1}, deleted=False, write="w")
+
+    def task(self, task: str, state: TaskState, ended: int) -> None:
+        """Keep a task's record."""
+        record = TaskRecord(id=task, instruction="x", state=state, updated_ns=ended)
+        self.put(f"task/{task}", msgspec.json.encode(record))
+
+    def owns(self, key: str) -> bool:
+        """Whether a key is ours."""
+        return "elsewhere" not in key
+
+    async def local(self, prefix: str) -> list[Record]:
+        """The shard."""
+        return [record for key, record in self.kept.items() if key.startswith(prefix)]
+
+    async def read(self, key: str) -> Record | None:
+        """One record."""
+        return self.kept.get(key)
+
+    async def remove(self, key: str, *, expected: dict[str, int]) -> None:
+        """Remove one."""
+        assert expected == {"gw-1": 1}
+        del self.kept[key]
+
+
+async def test_old_finished_tasks_and_their_effects_are_forgotten() -> None:
+    """Running tasks and those of other owners stay, whatever their age; effects follow their task."""
+    records = Records()
+    for number in range(4):
+        records.task(f"old-{number}", TaskState.SUCCEEDED, number)
+        records.put(f"effect/old-{number}/s1/1")
+    records.task("runs", TaskState.RUNNING, 0)
+    records.put("effect/runs/s1/1")
+    records.task("elsewhere", TaskState.SUCCEEDED, 0)
+    retention = Retention(cast("Plane", SimpleNamespace(dht=records)), TasksConfig(keep_finished=2))
+    assert await retention.round() == 2
+    assert await retention.round() == 2
+    assert await retention.round() == 0
+    assert set(records.kept) == {
+        "task/old-2", "task/old-3", "effect/old-2/s1/1", "effect/old-3/s1/1",
+        "task/runs", "effect/runs/s1/1", "task/elsewhere",
+    }  # fmt: skip
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.text("abc", min_size=1, max_size=3)), unique=True), st.integers(-1, 9))
+def test_what_goes_is_older_than_what_stays(finished: list[tuple[int, str]], keep: int) -> None:
+    """The newest are kept, never more than asked, and nothing else goes."""
+    gone = surplus(finished, keep)
+    assert len(finished) - len(gone) == min(len(finished), max(0, keep))
+    stays = [row for row in finished if row[1] not in gone]
+    goes = [row for row in finished if row[1] in gone and gone.count(row[1]) == 1]
+    if stays and goes and len({key for _, key in finished}) == len(finished):
+        assert max(goes) < min(stays)
