@@ -170,11 +170,11 @@ class Reconciler:
 
     async def _pull_from(self, member: str, ring: Ring, *, joining: bool) -> int:
         mine = dict(await self._store.digests())
-        shared: list[str] = []
+        shared: dict[str, str] = {}
         for number, (key, each) in enumerate(mine.items()):
             replicas = ring.successors(key, self._config.replicas)
             if member in replicas and self._gateway in replicas:
-                shared.append(each)
+                shared[key] = each
             if number % _BREATH == _BREATH - 1:
                 await asyncio.sleep(0)
         asked = DigestAsk(asker=self._gateway, summary=summary(shared), joining=joining)
@@ -236,15 +236,15 @@ class Reconciler:
         if not asked.joining:
             await self._until_seen(asked.asker)
         ring = self._membership.ring.with_member(asked.asker)
-        found: list[tuple[str, str]] = []
+        found: dict[str, str] = {}
         for number, (key, each) in enumerate(await self._store.digests()):
             if asked.asker in ring.successors(key, self._config.replicas):
-                found.append((key, each))
+                found[key] = each
             if number % _BREATH == _BREATH - 1:
                 await asyncio.sleep(0)
-        if asked.summary and asked.summary == summary([each for _, each in found]):
+        if asked.summary and asked.summary == summary(found):
             return DigestList(same=True)
-        rest = [(key, each) for key, each in found if key > asked.after]
+        rest = [(key, each) for key, each in found.items() if key > asked.after]
         return DigestList(digests=dict(rest[:_PAGE]), more=len(rest) > _PAGE)
 
     async def _until_seen(self, asker: str) -> None:

@@ -6,7 +6,7 @@ result descends from both, so replicas end up equal in whatever order they hear 
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import msgspec
 from msgspec import Struct
@@ -129,12 +129,13 @@ def digest(record: Record) -> str:
     return content.hexdigest()
 
 
-def summary(digests: "list[str] | tuple[str, ...]") -> str:
-    """One short text for a set of digests, whatever their order."""
-    total = 0
-    for each in digests:
-        total ^= int(each, 16)
-    return f"{len(digests)}:{total:016x}"
+def summary(digests: Mapping[str, str]) -> str:
+    """One short text for digests by key; equal only where every key has the same digest.
+
+    The keys are hashed too: many records are alike but for their key, and would cancel out in a mere sum of digests.
+    """
+    lines = "\n".join(sorted(f"{key} {each}" for key, each in digests.items()))
+    return f"{len(digests)}:{hashlib.blake2b(lines.encode(), digest_size=16).hexdigest()}"
 
 
 def check_key(key: str) -> str:

@@ -140,7 +140,23 @@ def test_digests_tell_records_apart(one: Record, other: Record) -> None:
     """Digests are equal exactly when version, content and removal are."""
     same = (one.version, one.value, one.deleted) == (other.version, other.value, other.deleted)
     assert (digest(one) == digest(other)) == same
-    assert summary([digest(one), digest(other)]) == summary([digest(other), digest(one)])
+
+
+digests = st.dictionaries(st.text("ab/", min_size=1, max_size=3), st.sampled_from([f"{n:016x}" for n in range(3)]))
+
+
+@given(digests, digests)
+def test_summaries_tell_shards_apart(one: dict[str, str], other: dict[str, str]) -> None:
+    """Summaries are equal exactly when every key has the same digest, in whatever order they are given."""
+    assert (summary(one) == summary(other)) == (one == other)
+    assert summary(dict(sorted(one.items(), reverse=True))) == summary(one)
+
+
+def test_records_that_are_alike_do_not_cancel_out() -> None:
+    """An even number of records that are alike but for their key is told apart from as many older ones."""
+    old, new = Record(key="k", value=b"old", version={"a": 1}), Record(key="k", value=b"new", version={"a": 1, "b": 1})
+    keys = [f"task/{n}" for n in range(4)]
+    assert summary(dict.fromkeys(keys, digest(old))) != summary(dict.fromkeys(keys, digest(new)))
 
 
 @pytest.mark.parametrize("key", ["", "x" * (MAX_KEY + 1), "a\nb", "\x00"])
