@@ -19,6 +19,7 @@ from msgspec import Struct
 from appliance.errors import ConflictError, DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
 from appliance.plane.membership import Membership
+from appliance.plane.pulse import Pulse
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
@@ -78,7 +79,9 @@ class Written(Struct, frozen=True):
 class Dht:
     """The replicated records as one gateway sees them."""
 
-    def __init__(self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership) -> None:
+    def __init__(
+        self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership, pulse: Pulse
+    ) -> None:
         self.resolver: Resolver | None = None
         self.on_ring_change: list[Callable[[], None]] = []
         self._config = config
@@ -86,6 +89,8 @@ class Dht:
         self._store = store
         self._rpc = rpc
         self._membership = membership
+        self._pulse = pulse
+        self._stalls = 0
         self._settled = Ring((), virtual_nodes=config.virtual_nodes)
         self._settling = asyncio.Condition()
         self._pushes: set[asyncio.Task[None]] = set()
@@ -187,9 +192,12 @@ class Dht:
         return Written(await self._replicate(record, asked))
 
     async def _decide(self, asked: Write) -> Record:
-        record = await self._store.change(
-            asked.key, lambda current: decide(current, asked, self._gateway), durable=asked.durable
-        )
+        def order(current: Record | None) -> Record:
+            if self._pulse.doubtful:
+                raise RefusedError(f"{self._gateway} stood still and may have been succeeded", remedy="ask again")
+            return decide(current, asked, self._gateway)
+
+        record = await self._store.change(asked.key, order, durable=asked.durable)
         if record is None:
             raise SwiftbotError("a decision without a record")
         return record
@@ -286,9 +294,13 @@ class Dht:
 
     # --- settling ---------------------------------------------------------------------------------------------
 
-    async def settled(self, ring: Ring) -> None:
-        """The shard has been reconciled with the members of that ring: what waited for it goes on."""
-        self._settled = ring
+    def reconciled(self) -> bool:
+        """Whether the shard has been reconciled with the members of the ring as it is just now."""
+        return self._settled == self._membership.ring and self._stalls == self._pulse.stalls
+
+    async def settled(self, ring: Ring, stalls: int) -> None:
+        """The shard has been reconciled with the members of that ring, `stalls` so far: what waited for it goes on."""
+        self._settled, self._stalls = ring, stalls
         async with self._settling:
             self._settling.notify_all()
 
@@ -296,7 +308,8 @@ class Dht:
         """Wait until this gateway has reconciled as the key's owner; it may have become that just now."""
 
         def mine() -> bool:
-            return bool(self._settled.members) and self._settled.owner(key) == self._gateway
+            known = bool(self._settled.members) and self._stalls == self._pulse.stalls
+            return known and self._settled.owner(key) == self._gateway
 
         if mine():
             return

@@ -12,6 +12,7 @@ from appliance.errors import ConfigError, UnreachableError
 from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
+from appliance.plane.pulse import Pulse
 from appliance.plane.reconcile import Reconciler
 from appliance.plane.registry import Registry
 from appliance.plane.ring import Ring
@@ -37,9 +38,18 @@ class Plane:
         self.rpc = Rpc(session, gateway)
         self._membership = Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
-        self.dht = Dht(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
+        self._pulse = Pulse(config.lease_ms / 1e3)
+        self.dht = Dht(
+            config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, pulse=self._pulse
+        )
         self._reconciler = Reconciler(
-            config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, dht=self.dht
+            config,
+            gateway=gateway,
+            store=store,
+            rpc=self.rpc,
+            membership=self._membership,
+            dht=self.dht,
+            pulse=self._pulse,
         )
         self.on_member_lost: list[Callable[[str], None]] = self._membership.on_lost
 
@@ -81,6 +91,7 @@ class Plane:
         for name in await self._present():
             membership.add(name)
         membership.start()
+        self._pulse.start()
         self.registry.start()
         await self._reconciler.join()
         membership.join()
@@ -125,6 +136,7 @@ class Plane:
         self.rpc.close()
         await self.session.close()
         await self.store.close()
+        self._pulse.close()
 
 
 class PlaneClient:

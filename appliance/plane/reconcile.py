@@ -18,6 +18,7 @@ from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.plane.dht import Dht, Found, StoreAsk
 from appliance.plane.keys import check_name
 from appliance.plane.membership import Membership
+from appliance.plane.pulse import Pulse
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
@@ -35,6 +36,10 @@ _SEE_S = 1.0
 """How long a member waits to see the token of the one that asks."""
 _AGAIN_S = 1.0
 """After a member could not be compared with."""
+_SOON_S = 0.1
+"""The same while requests wait for the comparison."""
+_TRIES = 3
+"""Comparisons with a new ring before this gateway goes on without a member that is seen but does not answer."""
 _BREATH = 500
 """Keys looked at before the loop gets a turn."""
 
@@ -74,7 +79,15 @@ class Reconciler:
     """Keeps one gateway's shard in step with the others'."""
 
     def __init__(
-        self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership, dht: Dht
+        self,
+        config: PlaneConfig,
+        *,
+        gateway: str,
+        store: Store,
+        rpc: Rpc,
+        membership: Membership,
+        dht: Dht,
+        pulse: Pulse,
     ) -> None:
         self._config = config
         self._gateway = gateway
@@ -82,6 +95,7 @@ class Reconciler:
         self._rpc = rpc
         self._membership = membership
         self._dht = dht
+        self._pulse = pulse
         self._changed = asyncio.Event()
         self._seen = asyncio.Condition()
         self._running: asyncio.Task[None] | None = None
@@ -90,6 +104,7 @@ class Reconciler:
         rpc.register("dht_fetch", FetchAsk, self._on_fetch, exchange=False)
         membership.on_joined.append(self._on_member)
         membership.on_lost.append(self._on_member)
+        pulse.on_stalled.append(self._changed.set)
 
     def start(self) -> None:
         """Reconcile now, at every change of membership, and every `anti_entropy_s`."""
@@ -107,26 +122,31 @@ class Reconciler:
             self._seen.notify_all()
 
     async def _run(self) -> None:
-        settled: Ring | None = None
+        settled: tuple[Ring, int] | None = None
+        tries = 0
         wait_s = 0.0
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
                     await self._changed.wait()
             self._changed.clear()
-            ring = self._membership.ring
+            now = ring, stalls = self._membership.ring, self._pulse.stalls
             try:
-                complete, fetched = await self._round(ring)
+                heard, handed, fetched = await self._round(ring)
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
-                complete, fetched = False, 0
-            wait_s = self._config.anti_entropy_s if complete else _AGAIN_S
-            if ring != self._membership.ring:
-                wait_s = 0.0
+                heard, handed, fetched = False, False, 0
+            wait_s = self._config.anti_entropy_s if heard and handed else _AGAIN_S
+            if now != (self._membership.ring, self._pulse.stalls):
+                tries, wait_s = 0, 0.0
                 continue
-            if ring != settled:
-                settled = ring
-                await self._dht.settled(ring)
+            if now != settled:
+                tries += 1
+                if not heard and tries < _TRIES:
+                    wait_s = _SOON_S
+                    continue
+                settled, tries = now, 0
+                await self._dht.settled(ring, stalls)
                 self._tell(self._dht.on_ring_change)
             elif fetched:
                 # A member that could not be asked when the ring changed was heard only now: same news.
@@ -139,14 +159,18 @@ class Reconciler:
             except Exception:  # supervision boundary: one listener's defect must not stop the repair
                 log.exception("a listener to the ring failed")
 
-    async def _round(self, ring: Ring) -> tuple[bool, int]:
-        """Compare with every other member; returns whether all could be asked, and how many records came in."""
+    async def _round(self, ring: Ring) -> tuple[bool, bool, int]:
+        """Compare with every other member.
+
+        Returns:
+            Whether all could be asked, whether all that belongs elsewhere was taken, how many records came in.
+        """
         results = await asyncio.gather(*(self._pull(each, ring) for each in sorted(ring.members - {self._gateway})))
         handed = await self._hand_over(ring)
         before_ns = time.time_ns() - int(self._config.tombstone_hours * 3.6e12)
         await self._store.forget_tombstones(before_ns)
-        complete = handed and all(fetched is not None for fetched in results)
-        return complete, sum(fetched or 0 for fetched in results)
+        heard = all(fetched is not None for fetched in results)
+        return heard, handed, sum(fetched or 0 for fetched in results)
 
     async def join(self) -> None:
         """Fetch what this gateway will own before it shows itself, so that its first requests wait less."""

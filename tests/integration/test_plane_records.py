@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from appliance.errors import ConfigError, ConflictError, PayloadError, SwiftbotError, UnreachableError
+from appliance.errors import ConfigError, ConflictError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.plane.node import STORE_FILE, Plane
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
@@ -53,8 +53,7 @@ class Fleet:
         """Wait until every gateway sees every other and has reconciled with them."""
         await _until(
             lambda: all(
-                len(plane.members()) == len(self.planes) and plane.dht._settled == plane.ring
-                for plane in self.planes.values()
+                len(plane.members()) == len(self.planes) and plane.dht.reconciled() for plane in self.planes.values()
             )
         )
 
@@ -403,3 +402,29 @@ async def test_a_fleet_that_cannot_be_written_to_says_so(fleet: Fleet) -> None:
     fleet.planes[1].rpc.close()
     with pytest.raises(UnreachableError, match="could not be written"):
         await plane.dht.write(key, b"", expected=None)
+
+
+async def test_a_gateway_that_stood_still_orders_nothing_until_it_knows(fleet: Fleet) -> None:
+    """An owner that stood still refuses writes sent before, has missed ones before it answers, then owns as before."""
+    plane = fleet.planes[2]
+    pulse = plane._pulse
+    key = fleet.owned_by(2)
+    version = await plane.dht.write(key, b"before", expected=None)
+    missed = Record(key=key, value=b"after", version={**version, "g0": 1}, write="w")
+    for number in (0, 1):
+        await fleet.planes[number].dht.keep(missed)
+    told = asyncio.Event()
+    plane.dht.on_ring_change.append(told.set)
+    pulse._last -= plane.config.lease_ms / 1e3
+    assert await plane.dht.read(key) == missed
+    assert plane.dht.reconciled()
+    await told.wait()
+    pulse._until = float("inf")
+    stale = Write(key=key, value=b"stale", expected=version, write="stale")
+    with pytest.raises(RefusedError, match="stood still"):
+        await plane.dht._on_write(stale)
+    writing = asyncio.create_task(fleet.planes[0].dht.write(key, b"next", expected=missed.version))
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(asyncio.shield(writing), 0.2)
+    pulse._until = 0.0
+    assert await writing == {"g0": 1, "g2": 2}
