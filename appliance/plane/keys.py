@@ -37,6 +37,10 @@ class Keys:
         """Liveliness token of a gateway."""
         return f"{self.root}/gw/{gateway}/alive"
 
+    def alive_again(self, gateway: str = "*", number: str = "*") -> str:
+        """A further token of a gateway that somebody does not see although they are linked."""
+        return f"{self.root}/gw/{gateway}/alive/{number}"
+
     def status(self, gateway: str = "*") -> str:
         """Put: GatewayStatus."""
         return f"{self.root}/gw/{gateway}/status"

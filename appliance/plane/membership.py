@@ -1,6 +1,8 @@
 """Who is there: the gateways whose liveliness token is seen, and the ring made of them.
 
-A token goes when its process dies (at once) or its link has been silent for a lease, so nobody is asked.
+A token goes when its process dies (at once) or its link has been silent for a lease, so nobody is asked. When a link
+is cut and made anew while the other end stands still, Zenoh may forget a token that is there and never mention it
+again; whoever hears from a gateway that it is not seen shows a further token, and is there while any of them is.
 """
 
 from collections.abc import Callable
@@ -16,6 +18,8 @@ log = structlog.get_logger(__name__)
 
 MOST = 1000
 """Gateways known at once; liveliness of more costs too much (design/platform). More are refused and counted."""
+_MOST_TOKENS = 8
+"""Of one gateway; more than two mean a mistake."""
 
 
 class Membership:
@@ -29,8 +33,12 @@ class Membership:
         self.ring = Ring(self._members, virtual_nodes=virtual_nodes)
         self.on_joined: list[Callable[[str], None]] = []
         self.on_lost: list[Callable[[str], None]] = []
-        self._watch: Closer | None = None
+        self._tokens: dict[str, set[str]] = {}
+        """Name -> keys of the tokens seen."""
+        self._watches: list[Closer] = []
         self._token: Closer | None = None
+        self._again: Closer | None = None
+        self._shown = 0
 
     @property
     def members(self) -> frozenset[str]:
@@ -39,7 +47,8 @@ class Membership:
 
     def start(self) -> None:
         """Begin to watch."""
-        self._watch = self._session.watch_alive(self._session.keys.alive(), self._seen)
+        keys = self._session.keys
+        self._watches = [self._session.watch_alive(each, self._seen) for each in (keys.alive(), keys.alive_again())]
 
     def add(self, name: str) -> None:
         """Count a gateway in before its token is watched."""
@@ -50,9 +59,19 @@ class Membership:
         if self._gateway is not None:
             self._token = self._session.declare_alive(self._session.keys.alive(self._gateway))
 
+    def show_again(self) -> None:
+        """Show a token that nobody can have forgotten: somebody does not see the first."""
+        if self._gateway is None or self._token is None:
+            return
+        self._shown += 1
+        before, again = self._again, self._session.keys.alive_again(self._gateway, str(self._shown))
+        self._again = self._session.declare_alive(again)
+        if before is not None:
+            before.close()
+
     def _seen(self, key: str, alive: bool) -> None:
-        name = key.split("/")[-2]
-        if name == self._gateway or alive == (name in self._members):
+        name = key.removeprefix(f"{self._session.keys.root}/gw/").partition("/")[0]
+        if name == self._gateway or not self._count(name, key, alive):
             return
         try:
             check_name(name, "gateway")
@@ -62,6 +81,8 @@ class Membership:
         if alive and len(self._members) >= MOST:
             self._session.refuse("too many gateways", key=key)
             return
+        if alive:
+            self._tokens[name] = {key}
         self._members = self._members | {name} if alive else self._members - {name}
         self.ring = Ring(self._members, virtual_nodes=self._virtual_nodes)
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
@@ -71,8 +92,25 @@ class Membership:
             except Exception:  # supervision boundary: the other listeners must hear of it all the same
                 log.exception("a listener to the membership failed", member=name)
 
+    def _count(self, name: str, key: str, alive: bool) -> bool:
+        """Note a token's coming or going; returns whether its gateway comes or goes with it."""
+        if name not in self._members:
+            return alive
+        tokens = self._tokens[name]
+        if not alive:
+            tokens.discard(key)
+            if not tokens:
+                del self._tokens[name]
+            return not tokens
+        if len(tokens) >= _MOST_TOKENS and key not in tokens:
+            self._session.refuse("too many tokens of a gateway", key=key)
+        else:
+            tokens.add(key)
+        return False
+
     def close(self) -> None:
         """Leave: the token is taken back first, so the others take over before this gateway stops answering."""
-        for closer in (self._token, self._watch):
+        for closer in (self._again, self._token, *self._watches):
             if closer is not None:
                 closer.close()
+        self._token = None

@@ -60,6 +60,8 @@ class DigestList(Struct, frozen=True, omit_defaults=True):
     digests: dict[str, str] = {}
     same: bool = False
     more: bool = False
+    unseen: bool = False
+    """The asker's token is not seen here, so nothing is told."""
 
 
 class FetchAsk(Struct, frozen=True):
@@ -205,6 +207,9 @@ class Reconciler:
         fetched = 0
         while True:
             answer = await self._rpc.call(member, "dht_digest", asked, DigestList, timeout_s=_ASK_S + _SEE_S)
+            if answer.unseen:
+                self._membership.show_again()
+                raise RefusedError(f"{member} does not see {self._gateway}", remedy="are the two linked?")
             if answer.same:
                 return fetched
             wanted = [key for key, each in answer.digests.items() if mine.get(key) != each]
@@ -257,8 +262,8 @@ class Reconciler:
 
     async def _on_digest(self, asked: DigestAsk) -> DigestList:
         check_name(asked.asker, "gateway")
-        if not asked.joining:
-            await self._until_seen(asked.asker)
+        if not asked.joining and not await self._is_seen(asked.asker):
+            return DigestList(unseen=True)
         ring = self._membership.ring.with_member(asked.asker)
         found: dict[str, str] = {}
         for number, (key, each) in enumerate(await self._store.digests()):
@@ -271,13 +276,14 @@ class Reconciler:
         rest = [(key, each) for key, each in found.items() if key > asked.after]
         return DigestList(digests=dict(rest[:_PAGE]), more=len(rest) > _PAGE)
 
-    async def _until_seen(self, asker: str) -> None:
-        """From when this answers on, this gateway no longer orders writes of keys that the asker owns."""
+    async def _is_seen(self, asker: str) -> bool:
+        """Wait until the asker is seen: from then on this gateway orders no writes of keys that the asker owns."""
         try:
             async with asyncio.timeout(_SEE_S), self._seen:
                 await self._seen.wait_for(lambda: asker in self._membership.members)
         except TimeoutError:
-            raise RefusedError(f"{self._gateway} does not see {asker}", remedy="are the two linked?") from None
+            return False
+        return True
 
     async def _on_fetch(self, asked: FetchAsk) -> FetchList:
         if len(asked.keys) > _PAGE:

@@ -404,6 +404,27 @@ async def test_a_fleet_that_cannot_be_written_to_says_so(fleet: Fleet) -> None:
         await plane.dht.write(key, b"", expected=None)
 
 
+async def test_a_token_that_got_lost_is_shown_again(fleet: Fleet) -> None:
+    """A gateway whose token another has lost though they are linked shows one more; nobody else takes it for gone."""
+    lost: list[str] = []
+    for number in (0, 2):
+        fleet.planes[number].on_member_lost.append(lost.append)
+    first, third = fleet.planes[1], fleet.planes[2]
+    third._membership._seen(first.keys.alive("g1"), alive=False)
+    assert lost == ["g1"]
+    for again in (1, 2):
+        first._reconciler._changed.set()
+        await _until(lambda: third.members() == {"g0", "g1", "g2"})
+        await fleet.settled()
+        assert await third.session.alive_now(first.keys.alive_again("g1")) == [first.keys.alive_again("g1", str(again))]
+        if again == 1:
+            third._membership._seen(first.keys.alive_again("g1", "1"), alive=False)
+    assert lost == ["g1", "g1"]
+    await fleet.stop(1)
+    await _until(lambda: lost[2:] == ["g1", "g1"])
+    assert fleet.planes[0].members() == third.members() == {"g0", "g2"}
+
+
 async def test_a_gateway_that_stood_still_orders_nothing_until_it_knows(fleet: Fleet) -> None:
     """An owner that stood still refuses writes sent before, has missed ones before it answers, then owns as before."""
     plane = fleet.planes[2]
