@@ -4,10 +4,14 @@ They exist so that tests need nothing from outside themselves: ports are asked o
 missing reference file is a failure that says how to get it, never a silent skip.
 """
 
+import asyncio
+import functools
+import inspect
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -18,6 +22,27 @@ settings.load_profile("alone")
 
 ROOT = Path(__file__).resolve().parent.parent
 """The project's root folder."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]:
+    """End an async test that waits in vain within the loop, a little before its time limit.
+
+    The limit's own alarm interrupts the loop but not the test: that would go on waiting in it, the fixtures could not
+    be torn down, and the whole run would hang.
+    """
+    test = pyfuncitem.obj
+    if inspect.iscoroutinefunction(test):
+        marker = pyfuncitem.get_closest_marker("timeout")
+        limit_s = float(marker.args[0] if marker is not None else pyfuncitem.config.getini("timeout") or 180)
+
+        @functools.wraps(test)
+        async def bounded(**arguments: Any) -> None:
+            async with asyncio.timeout(limit_s * 0.8):
+                await test(**arguments)
+
+        pyfuncitem.obj = bounded
+    return (yield)
 
 
 @pytest.fixture(scope="session")
