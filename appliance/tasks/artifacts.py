@@ -15,10 +15,13 @@ from typing import Any
 
 import anyio
 import anyio.to_thread
+import structlog
 from msgspec import Struct
 
-from appliance.errors import NotFoundError, PayloadError, RefusedError, UnreachableError
+from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
 from appliance.tasks.api import ArtifactAsk, ArtifactPiece
+
+log = structlog.get_logger(__name__)
 
 PIECE = 1 << 20
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -88,6 +91,8 @@ class Artifacts:
     async def piece(self, ask: ArtifactAsk) -> ArtifactPiece:
         """Read a piece of a file kept here; NotFoundError when it is not."""
         path = self.path(ask.artifact)
+        if not 0 <= ask.offset <= self._max_bytes or ask.length < 0:
+            raise PayloadError(f"no piece of {ask.length:,} bytes at {ask.offset:,}", remedy="ask within the file")
 
         def read() -> ArtifactPiece:
             try:
@@ -103,7 +108,7 @@ class Artifacts:
         """Return a file from here, from the gateway that made it, or from any that has it, verified.
 
         Raises:
-            PayloadError: not a reference, or the bytes do not match their digest.
+            PayloadError: not a reference, or every copy is damaged.
             NotFoundError: no gateway that answers has it.
         """
         digest = str(reference.get("artifact", ""))
@@ -111,16 +116,23 @@ class Artifacts:
         if path.exists():
             return await anyio.Path(path).read_bytes()
         maker = str(reference.get("gateway", ""))
+        damaged: list[str] = []
         others = sorted(members - {self._gateway}, key=lambda member: (member != maker, member))
         for member in others:
             try:
                 data = await self._fetch(digest, member, ask)
-            except (NotFoundError, UnreachableError):
+            except (NotFoundError, UnreachableError, DeadlineError, RefusedError) as error:
+                log.info("artifact is not to be had there", artifact=digest, gateway=member, reason=str(error))
                 continue
             if hashlib.sha256(data).hexdigest() != digest:
-                raise PayloadError(f"artifact {digest[:12]}… from {member} does not match its digest")
+                # A damaged copy must not hide a good one elsewhere.
+                log.warning("artifact does not match its digest", artifact=digest, gateway=member)
+                damaged.append(member)
+                continue
             await anyio.to_thread.run_sync(self._write, digest, data)
             return data
+        if damaged:
+            raise PayloadError(f"artifact {digest[:12]}… from {', '.join(damaged)} does not match its digest")
         raise NotFoundError(
             f"artifact {digest[:12]}… ({reference.get('name', '')}) is on no gateway that answers",
             remedy=f"bring {maker or 'the gateway that made it'} back",

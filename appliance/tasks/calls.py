@@ -7,6 +7,7 @@ telling never doubles an effect.
 
 import asyncio
 import base64
+import re
 import time
 from collections.abc import Callable
 from typing import Any, cast
@@ -23,9 +24,11 @@ from appliance.pool.pool import Call
 from appliance.robots.commands import send_command
 from appliance.tasks.api import ArtifactAsk, ArtifactPiece
 from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.bounds import MAX_RUN_S, clean
 
 log = structlog.get_logger(__name__)
 
+_NOT_A_NAME = re.compile(r"[^a-z0-9_.-]")
 BUSY_RETRY_S = 0.5
 """Pause before a busy robot is asked again."""
 
@@ -57,8 +60,11 @@ class Calls:
         if run.robot is None:
             raise PayloadError(f"{run.skill} commands a robot but its subtask names none")
         verb = str(call.args.get("verb", ""))
-        args = cast("dict[str, Any]", call.args.get("args") or {})
-        timeout_s = float(call.args.get("timeout_s", 60.0))
+        given: object = call.args.get("args") or {}
+        if not isinstance(given, dict):
+            raise PayloadError(f"the arguments of {verb[:40]!r} are not a table")
+        args = cast("dict[str, Any]", given)
+        timeout_s = _timeout(call.args.get("timeout_s", 60.0))
         command = RobotCommand(
             id=_effect(call), verb=verb, args=args, task=run.task, subtask=run.subtask, attempt=run.attempt
         )
@@ -78,7 +84,7 @@ class Calls:
 
     async def _notify(self, call: Call) -> dict[str, Any]:
         effect = _effect(call)
-        to = "".join(c if c.isalnum() or c in "_.-" else "_" for c in str(call.args.get("to", "operator")).lower())
+        to = _NOT_A_NAME.sub("_", str(call.args.get("to", "operator")).lower()).strip("_.-")[:60] or "operator"
         key = f"effect/{effect}"
         version = None
         try:
@@ -90,8 +96,8 @@ class Calls:
             version = record.version if record else None
         notice = Notice(
             id=effect,
-            to=check_name(to.strip("_.-")[:60] or "operator", "recipient"),
-            text=str(call.args.get("text", ""))[:4000],
+            to=check_name(to, "recipient"),
+            text=clean(str(call.args.get("text", "")), 4000),
             task=call.run.task,
             gateway=self._plane.gateway,
             at_ns=time.time_ns(),
@@ -110,6 +116,8 @@ class Calls:
                 data = base64.b64decode(data, validate=True)
             except ValueError as error:
                 raise PayloadError(f"the file's bytes are not base64: {error}") from error
+        if not isinstance(data, bytes):
+            raise PayloadError("put_artifact needs bytes", remedy="encode text first")
         reference = await self._artifacts.put(
             str(call.args.get("name", "file")), data, str(call.args.get("media_type", "application/octet-stream"))
         )
@@ -125,6 +133,13 @@ class Calls:
 
         data = await self._artifacts.get(cast("dict[str, Any]", reference), ask=ask, members=self._plane.members())
         return {"data": data}
+
+
+def _timeout(value: object) -> float:
+    """Seconds a command may take, as a handler says; PayloadError when that is no positive number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MAX_RUN_S:
+        raise PayloadError(f"timeout_s {str(value)[:40]} is not between 0 and {MAX_RUN_S:g} s")
+    return float(value)
 
 
 class _Effect(Struct):

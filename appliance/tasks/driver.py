@@ -9,13 +9,13 @@ same attempt.
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
 import msgspec
 import structlog
 
-from appliance.errors import ConflictError, PlanError, SwiftbotError
+from appliance.errors import ConflictError, NotFoundError, PlanError, SwiftbotError
 from appliance.model import (
     Failure,
     Plan,
@@ -31,6 +31,7 @@ from appliance.model import (
 )
 from appliance.tasks import machine
 from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.bounds import MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.surroundings import (
     CancelAsked,
@@ -45,6 +46,9 @@ from appliance.tasks.surroundings import (
 )
 
 log = structlog.get_logger(__name__)
+
+MAX_INBOX = 1000
+"""News that may wait for a driver; beyond it progress is dropped, beyond twice that what checks find out anyway."""
 
 
 class SupersededError(SwiftbotError):
@@ -63,12 +67,17 @@ class Driver:
         version: VersionVector,
         *,
         on_change: Callable[[TaskRecord], None],
+        give_up: Failure | None = None,
     ) -> None:
         self._around = around
         self._plane = around.plane
         self.record = record
         self._version = version
         self._on_change = on_change
+        self.ended = False
+        """Whether the task has ended and its last record is written; one that is final only here has not."""
+        self._give_up = give_up
+        """Why the task is to be ended instead of driven: earlier drivers of it broke."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
         self._ready_ns: dict[str, int] = {}
         self._not_before: dict[str, float] = {}
@@ -76,6 +85,8 @@ class Driver:
         self._waiting: dict[str, str] = {}
         self._orders: set[asyncio.Task[object]] = set()
         self._cancelled_at: float | None = None
+        self._cancel_at: dict[str, float] = {}
+        self._check_at = time.monotonic() + around.config.check_s
         self._pending: list[Transition] = []
         self._outgoing: list[tuple[str, RunRequest]] = []
         self._dirty = False
@@ -86,8 +97,20 @@ class Driver:
         return bool(self._waiting)
 
     def tell(self, news: Input) -> None:
-        """Hand in what happened; never blocks."""
+        """Hand in what happened; never blocks. What is of no use, or too much, is dropped: checks make up for it."""
+        if isinstance(news, RunNews) and not self._useful(news.event):
+            return
+        least = isinstance(news, Wake) or (isinstance(news, RunNews) and news.event.kind is RunEventKind.PROGRESS)
+        if self._inbox.qsize() >= (MAX_INBOX if least else 2 * MAX_INBOX) and not isinstance(news, CancelAsked):
+            return
         self._inbox.put_nowait(news)
+
+    def _useful(self, event: RunEvent) -> bool:
+        """Whether an event is of a current attempt and tells something that the record keeps."""
+        if event.kind in (RunEventKind.LOG, RunEventKind.PARTIAL):
+            return False
+        current = next((each for each in self.record.subtasks if each.subtask.id == event.subtask), None)
+        return current is not None and event.attempt == current.attempt and not current.state.final
 
     async def run(self) -> None:
         """Drive to the end."""
@@ -101,7 +124,10 @@ class Driver:
                 await self._handle(await self._next())
                 while not self._inbox.empty():
                     await self._handle(self._inbox.get_nowait())
+                # By the clock, not when nothing else happens: one talkative run must not hide a silent one.
+                await self._check()
             await self._flush()
+            self.ended = True
         except SupersededError as error:
             log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
         finally:
@@ -116,7 +142,7 @@ class Driver:
 
     def _pause_s(self) -> float:
         now = time.monotonic()
-        due = [at - now for at in self._not_before.values() if at > now]
+        due = [at - now for at in (*self._not_before.values(), self._check_at) if at > now]
         return max(0.01, min([self._around.config.check_s, *due]))
 
     # --- taking up ------------------------------------------------------------------------------------------
@@ -126,30 +152,39 @@ class Driver:
         if self.record.sequence > 1 or self.record.coordinator != self._plane.gateway:
             self._apply(self._transition(TransitionKind.ADOPTED))
             await self._flush()
-        for each in machine.active(self.record):
-            await self._ask_after(each)
+        if self._give_up is not None and self.record.state in (TaskState.ACCEPTED, TaskState.RUNNING):
+            kind = TransitionKind.CANCEL if self.record.subtasks else TransitionKind.PLAN_FAILED
+            self._apply(self._transition(kind, failure=self._give_up))
+        await self._ask_after(machine.active(self.record))
         if self.record.state is TaskState.ACCEPTED:
-            planning = asyncio.ensure_future(self._around.plan(self.record))
-            cancelled = await self._planning(planning)
-            if cancelled:
-                planning.cancel()
+            await self._plan()
+
+    async def _plan(self) -> None:
+        """Get a plan, unless a cancel comes first."""
+        planning = asyncio.ensure_future(self._around.plan(self.record))
+        try:
+            if await self._cancelled_before(planning):
                 self._apply(self._transition(TransitionKind.CANCEL))
                 return
-            try:
-                plan = planning.result()
-            except SwiftbotError as error:
-                self._apply(self._transition(TransitionKind.PLAN_FAILED, failure=_plan_failure(error)))
-                return
-            self._apply(self._transition(TransitionKind.PLANNED, plan=plan))
+            self._apply(self._transition(TransitionKind.PLANNED, plan=planning.result()))
+        except SwiftbotError as error:
+            self._apply(self._transition(TransitionKind.PLAN_FAILED, failure=_plan_failure(error)))
+        except Exception as error:  # the boundary to the planner: whatever breaks in it, the submitter is told
+            log.exception("planning broke", task=self.record.id)
+            failure = Failure(code="internal", message=clean(f"planning broke: {type(error).__name__}: {error}", 500))
+            self._apply(self._transition(TransitionKind.PLAN_FAILED, failure=failure))
+        finally:
+            planning.cancel()
 
-    async def _planning(self, planning: "asyncio.Future[Plan]") -> bool:
+    async def _cancelled_before(self, planning: "asyncio.Future[Plan]") -> bool:
         """Wait for the plan; True if a cancel came first."""
         while not planning.done():
             asking = asyncio.ensure_future(self._inbox.get())
-            done, _ = await asyncio.wait({planning, asking}, return_when=asyncio.FIRST_COMPLETED)
-            if asking in done and isinstance(asking.result(), CancelAsked):
-                return True
-            if asking not in done:
+            try:
+                await asyncio.wait({planning, asking}, return_when=asyncio.FIRST_COMPLETED)
+                if asking.done() and isinstance(asking.result(), CancelAsked):
+                    return True
+            finally:
                 asking.cancel()
         return False
 
@@ -163,12 +198,27 @@ class Driver:
         now = time.monotonic()
         for each in machine.ready(self.record):
             self._ready_ns.setdefault(each.subtask.id, time.monotonic_ns())
-            if self._not_before.get(each.subtask.id, 0.0) <= now:
+            if self.record.state is TaskState.RUNNING and self._not_before.get(each.subtask.id, 0.0) <= now:
                 self._not_before.pop(each.subtask.id, None)
                 self._dispatch(each)
 
     def _dispatch(self, target: SubtaskRecord) -> None:
         subtask = target.subtask
+        try:
+            manifest = self._around.manifest(subtask.skill)
+        except NotFoundError as error:
+            # Planned on a gateway that knows more skills than this one, or before this one forgot it.
+            failure = Failure(code=error.code, message=error.message, remedy=error.remedy)
+            self._apply(
+                self._transition(
+                    TransitionKind.ATTEMPT_FAILED,
+                    subtask=subtask.id,
+                    attempt=target.attempt + 1,
+                    failure=failure,
+                    give_up=True,
+                )
+            )
+            return
         robot = None
         if subtask.robot is not None:
             robot, reason = self._around.bind(self.record, target)
@@ -187,7 +237,6 @@ class Driver:
                 TransitionKind.DISPATCHED, subtask=subtask.id, attempt=attempt, gateway=gateway, robot=robot
             )
         )
-        manifest = self._around.manifest(subtask.skill)
         request = RunRequest(
             task=self.record.id,
             subtask=subtask.id,
@@ -216,6 +265,10 @@ class Driver:
                 retryable=True,
             )
             self.tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
+        except Exception as error:  # the boundary to the executor here: the attempt fails, the task goes on
+            log.exception("run order broke", run=request.run_id, gateway=gateway)
+            failure = Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
+            self.tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
 
     def _inputs(self, target: SubtaskRecord) -> dict[str, dict[str, Any]]:
         """Results of the subtasks it comes after, directly or not: a report needs the picture two steps back."""
@@ -229,27 +282,30 @@ class Driver:
         return found
 
     def _wait(self, target: SubtaskRecord, reason: str) -> None:
-        """Tell people why it waits, once per reason, and look again soon."""
+        """Tell people why it waits, once per reason, and look again soon.
+
+        Written to the record, since every gateway must be able to say why nothing goes on.
+        """
         self._not_before[target.subtask.id] = time.monotonic() + 0.5
         if self._waiting.get(target.subtask.id) != reason:
             self._waiting[target.subtask.id] = reason
             self._apply(
                 self._transition(
-                    TransitionKind.PROGRESS, subtask=target.subtask.id, attempt=target.attempt, note=reason
-                ),
-                durable=False,
+                    TransitionKind.PROGRESS, subtask=target.subtask.id, attempt=target.attempt, note=clean(reason, 500)
+                )
             )
 
     def _end_runs(self) -> None:
         now = time.monotonic()
-        first = self._cancelled_at is None
         if self._cancelled_at is None:
             self._cancelled_at = now
         for each in machine.active(self.record):
             if now - self._cancelled_at > self._around.config.grace_s:
                 failure = Failure(code="cancelled", message=f"{each.gateway} did not confirm the cancel in time")
                 self._attempt_failed(each, failure, None)
-            elif first:
+            elif self._cancel_at.get(each.subtask.id, 0.0) <= now:
+                # Again and again: the first may overtake the order to run, or be lost.
+                self._cancel_at[each.subtask.id] = now + self._around.config.check_s
                 self._start(self._ask(each, "run_cancel"))
 
     # --- what happened --------------------------------------------------------------------------------------
@@ -269,7 +325,6 @@ class Driver:
             case Wake():
                 for subtask in self._waiting:
                     self._not_before.pop(subtask, None)
-                await self._check()
 
     def _run_news(self, event: RunEvent) -> None:
         try:
@@ -278,6 +333,7 @@ class Driver:
             return
         if event.attempt != target.attempt or target.state.final:
             return
+        event = tidy(event, max_result_bytes=self._around.config.max_result_bytes)
         common: dict[str, Any] = {
             "subtask": event.subtask,
             "attempt": event.attempt,
@@ -307,15 +363,15 @@ class Driver:
             case RunEventKind.LOG | RunEventKind.PARTIAL:
                 pass
 
-    def _take(self, transition: Transition, *, durable: bool = True) -> None:
-        if machine.fits(self.record, transition):
+    def _take(self, transition: Transition, *, durable: bool = True) -> bool:
+        if fits := machine.fits(self.record, transition):
             self._apply(transition, durable=durable)
+        return fits
 
     def _attempt_failed(self, target: SubtaskRecord, failure: Failure, duration_ms: float | None) -> None:
-        manifest = self._around.manifest(target.subtask.skill)
         judged = _with_failure(target, failure)
-        give_up = machine.gives_up(judged, failure, retries=manifest.retries + 1)
-        self._take(
+        give_up = machine.gives_up(judged, failure, retries=self._retries(target) + 1)
+        taken = self._take(
             self._transition(
                 TransitionKind.ATTEMPT_FAILED,
                 subtask=target.subtask.id,
@@ -326,40 +382,68 @@ class Driver:
                 duration_ms=duration_ms,
             )
         )
-        self._ready_ns[target.subtask.id] = time.monotonic_ns()
-        if not give_up:
+        if taken and not give_up:
+            self._ready_ns[target.subtask.id] = time.monotonic_ns()
             self._not_before[target.subtask.id] = time.monotonic() + machine.retry_delay_s(target.attempt)
 
+    def _retries(self, target: SubtaskRecord) -> int:
+        try:
+            return self._around.manifest(target.subtask.skill).retries
+        except NotFoundError:
+            return 0
+
+    def _limit_s(self, target: SubtaskRecord) -> float:
+        """How long a run may take; for a skill that only its gateway knows, as long as any."""
+        try:
+            return deadline_s(self._around.manifest(target.subtask.skill), target.subtask.params)
+        except NotFoundError:
+            return MAX_RUN_S
+
     async def _check(self) -> None:
-        """Ask after runs in case an event was lost, and give up those that are silent past their deadline."""
-        members = self._plane.members()
+        """When it is time: ask after runs, in case an event was lost, and give up the silent past their deadline."""
         now = time.monotonic()
+        if now < self._check_at:
+            return
+        self._check_at = now + self._around.config.check_s
+        members = self._plane.members()
+        asked: list[SubtaskRecord] = []
         for each in machine.active(self.record):
+            limit = self._limit_s(each)
+            silent_s = now - self._sent_at.setdefault(each.subtask.id, now)
             if each.gateway not in members:
                 await self._handle(GatewayLost(each.gateway))
-                continue
-            limit = deadline_s(self._around.manifest(each.subtask.skill), each.subtask.params)
-            if now - self._sent_at.setdefault(each.subtask.id, now) > limit + self._around.config.grace_s:
+            elif silent_s > limit + self._around.config.grace_s:
                 failure = Failure(code="deadline", message=f"nothing came of it within {limit:.0f} s")
                 self._attempt_failed(each, failure, None)
-            elif now - self._sent_at[each.subtask.id] > self._around.config.check_s:
-                await self._ask_after(each)
+            elif silent_s > self._around.config.check_s:
+                asked.append(each)
+        await self._ask_after(asked)
+        # Answers may have taken a while; the next look is a whole interval away from them.
+        self._check_at = time.monotonic() + self._around.config.check_s
 
-    async def _ask_after(self, target: SubtaskRecord) -> None:
-        """Learn from its gateway what became of a run."""
-        status = await self._ask(target, "run_status")
+    async def _ask_after(self, targets: Sequence[SubtaskRecord]) -> None:
+        """Learn from their gateways what became of runs."""
+        answers = await asyncio.gather(*(self._ask(each, "run_status") for each in targets))
+        for target, status in zip(targets, answers, strict=True):
+            self._learn(target, status)
+
+    def _learn(self, target: SubtaskRecord, status: RunStatus | None) -> None:
+        lost = ""
         if status is None:
             if target.gateway not in self._plane.members():
-                failure = Failure(code="unreachable", message=f"{target.gateway} was lost", retryable=True)
-                self._attempt_failed(target, failure, None)
-            return
-        if status.last is not None and (not status.running or status.last.kind is RunEventKind.STARTED):
-            self._run_news(status.last)
+                lost = f"{target.gateway} was lost"
         elif status.last is None:
             sent = self._sent_at.get(target.subtask.id, 0.0)
-            if time.monotonic() - sent > self._around.config.run_timeout_s:
-                failure = Failure(code="unreachable", message=f"{target.gateway} does not know the run", retryable=True)
-                self._attempt_failed(target, failure, None)
+            if not status.running and time.monotonic() - sent > self._around.config.run_timeout_s:
+                lost = f"{target.gateway} does not know the run"
+        elif status.last.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+            self._run_news(status.last)
+        elif not status.running:
+            lost = f"{target.gateway} lost the run"
+        elif status.last.kind is RunEventKind.STARTED:
+            self._run_news(status.last)
+        if lost:
+            self._attempt_failed(target, Failure(code="unreachable", message=lost, retryable=True), None)
 
     async def _ask(self, target: SubtaskRecord, verb: str) -> RunStatus | None:
         ask = RunAsk(task=self.record.id, subtask=target.subtask.id, attempt=target.attempt)
@@ -434,7 +518,7 @@ class Driver:
         current = await self._plane.dht.read(task_key(self.record.id))
         holder = ""
         if current is not None:
-            holder = msgspec.json.decode(current.value, type=TaskRecord).coordinator
+            holder = read_record(current.value).coordinator
         raise SupersededError(f"the record has moved on to {holder or 'nobody'}")
 
 

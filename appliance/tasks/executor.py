@@ -14,7 +14,7 @@ import msgspec
 import structlog
 from msgspec.structs import replace
 
-from appliance.errors import RefusedError, SwiftbotError
+from appliance.errors import DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import (
     Failure,
     Phase,
@@ -22,14 +22,15 @@ from appliance.model import (
     RunEvent,
     RunEventKind,
     RunRequest,
-    TaskRecord,
     encode,
 )
+from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.settings import TasksConfig
 
 log = structlog.get_logger(__name__)
@@ -48,6 +49,9 @@ class Executor:
         self._pool = pool
         self._running: dict[str, asyncio.Task[None]] = {}
         self._accepted: dict[str, RunAccepted] = {}
+        self._accepting: dict[str, asyncio.Task[RunAccepted]] = {}
+        self._withdrawn: set[str] = set()
+        """Orders being decided on that must not begin any more."""
         self._last: dict[str, RunEvent] = {}
         self._background: set[asyncio.Future[object]] = set()
         self._attempts: dict[tuple[str, str], int] = {}
@@ -63,8 +67,13 @@ class Executor:
         """Load what was kept; a run that was in progress when the gateway went down has failed."""
         self._records = self._plane.session.subscribe(self._plane.keys.task(), self._on_record)
         for key, value in await self._plane.store.scan("run/"):
-            event = msgspec.json.decode(value, type=RunEvent)
             run_id = key.removeprefix("run/")
+            try:
+                event = msgspec.json.decode(value, type=RunEvent)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                log.warning("a kept run event cannot be read and is dropped", run=run_id, reason=str(error))
+                await self._plane.store.delete(key)
+                continue
             if event.kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
                 event = replace(
                     event,
@@ -84,30 +93,53 @@ class Executor:
         Raises:
             RefusedError: the gateway drains, the attempt is outdated, or no container can be had.
             PoolError: no container can be started now.
+            PayloadError: no such names or numbers can be.
+            UnreachableError: it was passed on, and whether it was taken there is not known.
         """
+        check_name(request.task, "task")
+        check_name(request.subtask, "subtask")
+        if request.attempt < 1 or not 0 < request.deadline_s <= MAX_RUN_S + 3600:
+            raise PayloadError(f"attempt {request.attempt} within {request.deadline_s:g} s cannot be run")
         run_id = request.run_id
         if run_id in self._accepted:
             return self._accepted[run_id]
-        newest = self._attempts.get((request.task, request.subtask), 0)
-        if request.attempt < newest:
-            raise RefusedError(f"attempt {request.attempt} of {request.subtask} is outdated by attempt {newest}")
-        if self.draining:
-            raise RefusedError(f"{self._plane.gateway} is draining", remedy="another gateway takes it")
-        self._attempts[(request.task, request.subtask)] = request.attempt
+        accepting = self._accepting.get(run_id)
+        if accepting is None:
+            # A task of its own: the same order may come twice, and whoever asked may go away, while it is decided.
+            accepting = asyncio.create_task(self._accept(request), name=f"accept {run_id}")
+            self._accepting[run_id] = accepting
+            accepting.add_done_callback(lambda done: self._decided(run_id, done))
+        return await asyncio.shield(accepting)
+
+    def _decided(self, run_id: str, done: "asyncio.Task[RunAccepted]") -> None:
+        del self._accepting[run_id]
+        self._withdrawn.discard(run_id)
+        if not done.cancelled():
+            done.exception()  # whoever asked has it; if nobody waits any more, nobody misses it
+
+    async def _accept(self, request: RunRequest) -> RunAccepted:
+        run_id = request.run_id
+        self._check(request)
         await self._end_older(request)
         received_ns = time.monotonic_ns()
         decision = await self._pool.select(request.need, allow_remote=request.hops == 0)
         if decision.phase is Phase.REMOTE_WARM:
+            self._check(request)
             try:
                 return await self._plane.rpc.call(
                     decision.gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=2.0
                 )
+            except DeadlineError as error:
+                # It may run there or not: only a new attempt, which ends this one wherever it is, is safe.
+                raise UnreachableError(f"{decision.gateway} did not say whether it runs {run_id}") from error
             except SwiftbotError as error:
                 # The container was taken or its gateway went away meanwhile: what is left is here.
                 log.info("remote container lost", run=run_id, gateway=decision.gateway, reason=str(error))
                 decision = await self._pool.select(request.need, allow_remote=False)
         if request.hops and decision.phase is Phase.COLD:
             raise RefusedError(f"{self._plane.gateway} has no ready container of {request.need.image} any more")
+        # Much may have happened while other gateways were asked.
+        self._check(request)
         phase = Phase.REMOTE_WARM if request.hops else decision.phase
         accepted = RunAccepted(
             gateway=self._plane.gateway, container=decision.container or "", phase=phase, why=decision.why
@@ -124,9 +156,19 @@ class Executor:
         self._remember(run_id, begun)
         task = asyncio.create_task(self._carry_out(request, decision, received_ns), name=f"run {run_id}")
         self._running[run_id] = task
-        task.add_done_callback(lambda _: self._ended(run_id))
+        task.add_done_callback(lambda done: self._ended(run_id, done))
         self.on_change()
         return accepted
+
+    def _check(self, request: RunRequest) -> None:
+        """Refuse what must not begin (any more)."""
+        newest = self._attempts.get((request.task, request.subtask), 0)
+        if request.attempt < newest:
+            raise RefusedError(f"attempt {request.attempt} of {request.subtask} is outdated by attempt {newest}")
+        if self.draining:
+            raise RefusedError(f"{self._plane.gateway} is draining", remedy="another gateway takes it")
+        if request.run_id in self._withdrawn:
+            raise RefusedError(f"attempt {request.attempt} of {request.subtask} was called off before it began")
 
     async def _carry_out(self, request: RunRequest, decision: Decision, received_ns: int) -> None:
         run_id = request.run_id
@@ -140,7 +182,7 @@ class Executor:
                 self._last[run_id] = told
             self._publish(told)
 
-        begun = asyncio.create_task(self._plane.store.put(f"run/{run_id}", encode(self._last[run_id]), durable=False))
+        begun = asyncio.create_task(self._keep(run_id, self._last[run_id]))
         try:
             final = await self._pool.run(request, decision, tell)
         except SwiftbotError as error:
@@ -152,20 +194,20 @@ class Executor:
             final = _failed(
                 request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
             )
-        size = len(encode(final.result))
-        if size > self._config.max_result_bytes:
-            failure = Failure(
-                code="payload",
-                message=f"the result has {size:,} bytes, more than {self._config.max_result_bytes:,}",
-                remedy="have the handler put it into an artifact",
-            )
-            final = replace(final, kind=RunEventKind.FAILED, result=None, failure=failure)
         final = replace(final, gateway=self._plane.gateway, phase=_seen_from_afar(final.phase, request))
+        final = tidy(final, max_result_bytes=self._config.max_result_bytes)
         self._remember(run_id, final)
         await begun
         # Kept before it is told: a coordinator that misses the event finds it here.
-        await self._plane.store.put(f"run/{run_id}", encode(final), durable=False)
+        await self._keep(run_id, final)
         self._publish(final)
+
+    async def _keep(self, run_id: str, event: RunEvent) -> None:
+        """Keep an event over a restart; a store that cannot must not keep the outcome from being told."""
+        try:
+            await self._plane.store.put(f"run/{run_id}", encode(event), durable=False)
+        except SwiftbotError as error:
+            log.warning("run event could not be kept", run=run_id, reason=str(error))
 
     def _publish(self, event: RunEvent) -> None:
         self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event))
@@ -182,7 +224,7 @@ class Executor:
                 kind=RunEventKind.PROGRESS,
                 gateway=self._plane.gateway,
                 progress=last.progress if last else 0.0,
-                note=note,
+                note=clean(note, MAX_NOTE),
             )
         )
 
@@ -191,7 +233,9 @@ class Executor:
         key = (event.task, event.subtask)
         self._attempts[key] = max(event.attempt, self._attempts.get(key, 0))
         while len(self._last) > KEPT_RUNS:
-            oldest = next(each for each in self._last if each not in self._running)
+            oldest = next((each for each in self._last if each not in self._running), None)
+            if oldest is None:
+                return
             self._forget(oldest)
 
     def _forget(self, run_id: str) -> None:
@@ -201,7 +245,10 @@ class Executor:
         self._later(self._plane.store.delete(f"run/{run_id}"))
 
     async def _end_older(self, request: RunRequest) -> None:
-        """End an outdated attempt that still runs here."""
+        """End an outdated attempt that still runs here, or is about to."""
+        for run_id in self._accepting:
+            if run_id.startswith(f"{request.task}/{request.subtask}/") and _number(run_id) < request.attempt:
+                self._withdrawn.add(run_id)
         for run_id in [each for each in self._running if each.startswith(f"{request.task}/{request.subtask}/")]:
             if run_id != request.run_id:
                 await self._pool.cancel(run_id)
@@ -210,14 +257,21 @@ class Executor:
         """End runs whose attempt the record has left behind; forget the runs of a task that has ended."""
         task = message.key.split("/")[-2]
         mine = [run_id for run_id in self._last if run_id.startswith(f"{task}/")]
-        if not mine or message.deleted:
+        coming = [run_id for run_id in self._accepting if run_id.startswith(f"{task}/")]
+        if not (mine or coming) or message.deleted:
             return
         try:
-            record = msgspec.json.decode(message.payload, type=TaskRecord)
-        except (msgspec.DecodeError, UnicodeDecodeError):
-            self._plane.session.refuse("malformed task", key=message.key)
+            record = read_record(message.payload)
+        except PayloadError as error:
+            self._plane.session.refuse("malformed task", key=message.key, reason=str(error))
+            return
+        if record.id != task:
+            self._plane.session.refuse("malformed task", key=message.key, reason=f"the record is of {record.id[:80]}")
             return
         attempts = {each.subtask.id: each.attempt for each in record.subtasks}
+        for run_id in coming:
+            if record.state.final or _number(run_id) < attempts.get(run_id.split("/")[1], 0):
+                self._withdrawn.add(run_id)
         for run_id in mine:
             event = self._last[run_id]
             outdated = event.attempt < attempts.get(event.subtask, 0)
@@ -230,18 +284,29 @@ class Executor:
     def _later(self, work: Coroutine[Any, Any, object]) -> None:
         task = asyncio.ensure_future(work)
         self._background.add(task)
-        task.add_done_callback(self._background.discard)
+        task.add_done_callback(self._background_done)
 
-    def _ended(self, run_id: str) -> None:
+    def _background_done(self, done: "asyncio.Future[object]") -> None:
+        self._background.discard(done)
+        if not done.cancelled() and (error := done.exception()) is not None:
+            log.warning("tidying up after a run failed", reason=str(error))
+
+    def _ended(self, run_id: str, done: "asyncio.Task[None]") -> None:
         self._running.pop(run_id, None)
+        if not done.cancelled() and (error := done.exception()) is not None:
+            # The coordinator asks after the run, sees that it has ended with nothing, and repeats it.
+            log.error("run was not brought to its end", run=run_id, exc_info=error)
         self.on_change()
 
     async def status(self, ask: RunAsk) -> RunStatus:
         """Tell what is known of a run."""
-        return RunStatus(running=ask.run_id in self._running, last=self._last.get(ask.run_id))
+        running = ask.run_id in self._running or ask.run_id in self._accepting
+        return RunStatus(running=running, last=self._last.get(ask.run_id))
 
     async def cancel(self, ask: RunAsk) -> RunStatus:
         """Ask a run to end; its final event follows."""
+        if ask.run_id in self._accepting:
+            self._withdrawn.add(ask.run_id)
         if ask.run_id in self._running:
             await self._pool.cancel(ask.run_id)
         return await self.status(ask)
@@ -250,14 +315,24 @@ class Executor:
         """Accept nothing more and wait for the runs in progress; what is left then is cancelled."""
         self.draining = True
         self.on_change()
-        if self._records is not None:
-            self._records.close()
-        if self._running:
-            await asyncio.wait(list(self._running.values()), timeout=deadline_s)
-        for run_id in list(self._running):
-            await self._pool.cancel(run_id)
-        if self._running:
-            await asyncio.wait(list(self._running.values()), timeout=5.0)
+        try:
+            if self._running:
+                await asyncio.wait(list(self._running.values()), timeout=deadline_s)
+            for run_id in list(self._running):
+                await self._pool.cancel(run_id)
+            if self._running:
+                await asyncio.wait(list(self._running.values()), timeout=5.0)
+        finally:
+            # Until here records are heard: a task that ends or moves on elsewhere ends its runs here.
+            if self._records is not None:
+                self._records.close()
+            if self._background:
+                await asyncio.wait(list(self._background), timeout=2.0)
+
+
+def _number(run_id: str) -> int:
+    """The attempt in a run's id."""
+    return int(run_id.rpartition("/")[2])
 
 
 def _seen_from_afar(phase: Phase | None, request: RunRequest) -> Phase | None:

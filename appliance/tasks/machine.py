@@ -239,10 +239,11 @@ def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
     return _stop_rest(replace(failed, state=TaskState.CANCELLING, failure=failure))
 
 
-def _cancel(record: TaskRecord, _: Transition) -> TaskRecord:
+def _cancel(record: TaskRecord, event: Transition) -> TaskRecord:
+    """Stop everything; with a `failure` it is the appliance that gives the task up, not a person."""
     if record.state is TaskState.CANCELLING:
         raise StaleTransitionError(f"task {record.id} is being cancelled already")
-    return _stop_rest(replace(record, state=TaskState.CANCELLING, failure=None))
+    return _stop_rest(replace(record, state=TaskState.CANCELLING, failure=event.failure))
 
 
 def _stop_rest(record: TaskRecord) -> TaskRecord:

@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import cast
 
-import msgspec
 import structlog
 from msgspec.structs import replace
 
@@ -32,6 +31,7 @@ from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import PlanContext
 from appliance.llm.validate import validate
 from appliance.model import (
+    Failure,
     Plan,
     RunAccepted,
     RunEvent,
@@ -48,6 +48,7 @@ from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_deep
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
 from appliance.tasks.machine import Transition, TransitionKind
@@ -56,6 +57,12 @@ from appliance.tasks.settings import TasksConfig
 from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, need_of, task_key
 
 log = structlog.get_logger(__name__)
+
+SWEEP_S = 15.0
+"""How often the shard is looked through when the ring stands still."""
+MAX_BREAKS = 6
+"""Drivers of one task that may break before it is ended with the reason; with the pauses, half a minute."""
+MAX_SUBMITTER = 120
 
 
 class TaskManager:
@@ -80,7 +87,11 @@ class TaskManager:
         self._drivers: dict[str, Driver] = {}
         self._driving: dict[str, asyncio.Task[None]] = {}
         self._breaks: Counter[str] = Counter()
-        """How often a task's driver has broken; each time it is left alone for longer."""
+        """How often a task's driver has broken; each time it is left alone for longer, in the end given up."""
+        self._why: dict[str, Failure] = {}
+        """Why the last driver of a task broke."""
+        self._final: dict[str, VersionVector] = {}
+        """Records of the shard known to be final, which need not be decoded at every sweep."""
         self._closers: list[Callable[[], None]] = []
         self._stopping = False
         self._sweep = asyncio.Event()
@@ -157,6 +168,10 @@ class TaskManager:
                 f"the instruction has {len(instruction):,} characters, more than {self.config.max_instruction_chars:,}",
                 remedy="split it, or raise tasks.max_instruction_chars",
             )
+        if len(request.submitter) > MAX_SUBMITTER:
+            raise PayloadError(f"the submitter's name has more than {MAX_SUBMITTER} characters")
+        if request.plan is not None and any(too_deep(each.params) for each in request.plan.subtasks):
+            raise PayloadError(f"parameters are nested more than {MAX_DEPTH} deep", remedy="write them flat")
         task = request.id or f"t-{uuid.uuid4().hex[:10]}"
         return replace(request, instruction=instruction, id=check_name(task, "task"))
 
@@ -182,6 +197,8 @@ class TaskManager:
         try:
             version = await self.plane.dht.write(task_key(record.id), encode(record), expected=None)
         except ConflictError:
+            # Known already; perhaps by a first try whose answer was lost before it was driven.
+            self._sweep.set()
             return await self.task(TaskAsk(id=request.id))
         self.plane.session.put(self.plane.keys.transition(record.id), encode(transition))
         self.plane.session.put(self.plane.keys.task(record.id), encode(record))
@@ -194,7 +211,8 @@ class TaskManager:
     def _drive(self, record: TaskRecord, version: VersionVector) -> None:
         if record.id in self._drivers or self._stopping:
             return
-        driver = Driver(self, record, version, on_change=lambda _: self.on_change())
+        give_up = self._why.get(record.id) if self._breaks[record.id] >= MAX_BREAKS else None
+        driver = Driver(self, record, version, on_change=lambda _: self.on_change(), give_up=give_up)
         self._drivers[record.id] = driver
         task = asyncio.create_task(driver.run(), name=f"drive {record.id}")
         self._driving[record.id] = task
@@ -204,25 +222,37 @@ class TaskManager:
     def _driven(self, driver: Driver, done: asyncio.Task[None]) -> None:
         self._drivers.pop(driver.record.id, None)
         self._driving.pop(driver.record.id, None)
+        task = driver.record.id
         if not done.cancelled() and (error := done.exception()) is not None:
             # The record stands as it was last written: a new driver takes it up from there.
-            log.error("driver broke", task=driver.record.id, exc_info=error)
-            self._breaks[driver.record.id] += 1
-        if not driver.record.state.final and not self._stopping:
-            pause_s = min(30.0, 0.5 * 2 ** self._breaks[driver.record.id])
-            asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
+            log.error("driver broke", task=task, exc_info=error)
+            if not isinstance(error, UnreachableError | DeadlineError):
+                self._breaks[task] += 1
+                what = error.message if isinstance(error, SwiftbotError) else f"{type(error).__name__}: {error}"
+                self._why[task] = Failure(code="internal", message=clean(f"driving it broke: {what}", MAX_TEXT))
+        if driver.ended or self._stopping:
+            self._breaks.pop(task, None)
+            self._why.pop(task, None)
+            log.info("task ended" if driver.ended else "task is handed over", task=task, state=str(driver.record.state))
         else:
-            log.info("task ended", task=driver.record.id, state=str(driver.record.state))
+            pause_s = min(30.0, 0.5 * 2 ** self._breaks[task])
+            asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
         self.on_change()
 
     async def _keep_sweeping(self) -> None:
+        """Take up what is ours when the ring changes, and now and then in any case.
+
+        A task can be accepted by a gateway that learns a moment later that the key is another's: without the
+        regular look its owner, who has swept before the record came, would never drive it.
+        """
         while True:
-            await self._sweep.wait()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._sweep.wait(), timeout=SWEEP_S)
             self._sweep.clear()
             try:
                 await self._take_up()
-            except SwiftbotError as error:
-                log.warning("takeover is tried again", reason=str(error))
+            except Exception as error:  # without takeover a lost gateway's tasks would hang: it must not die
+                log.exception("takeover is tried again", reason=str(error))
                 asyncio.get_running_loop().call_later(1.0, self._sweep.set)
 
     async def _take_up(self) -> None:
@@ -230,20 +260,31 @@ class TaskManager:
         for task_id, driving in list(self._driving.items()):
             if not self.plane.dht.owns(task_key(task_id)):
                 driving.cancel()
+        final: dict[str, VersionVector] = {}
         for stored in await self.plane.dht.local("task/"):
             if stored.deleted or not self.plane.dht.owns(stored.key):
                 continue
+            if self._final.get(stored.key) == stored.version:
+                final[stored.key] = stored.version
+                continue
             try:
-                record = msgspec.json.decode(stored.value, type=TaskRecord)
-            except msgspec.DecodeError as error:
+                record = read_record(stored.value)
+            except PayloadError as error:
                 log.warning("task record cannot be read", key=stored.key, reason=str(error))
                 continue
-            if not record.state.final and record.id not in self._drivers:
+            if record.state.final:
+                final[stored.key] = stored.version
+            elif record.id not in self._drivers:
                 self._drive(record, stored.version)
+        self._final = final
 
-    def _on_run_event(self, key: str, event: RunEvent | None) -> None:  # noqa: ARG002 - the event names its run
-        if event is not None and (driver := self._drivers.get(event.task)):
-            driver.tell(RunNews(event))
+    def _on_run_event(self, key: str, event: RunEvent | None) -> None:
+        if event is None or (driver := self._drivers.get(event.task)) is None:
+            return
+        if not key.endswith(f"/task/{event.task}/run/{event.subtask}") or event.gateway not in self.plane.members():
+            self.plane.session.refuse("forged run event", key=key, reason=f"from {clean(event.gateway, 80)!r}")
+            return
+        driver.tell(RunNews(event))
 
     def _on_member_lost(self, gateway: str) -> None:
         for driver in self._drivers.values():
@@ -275,12 +316,19 @@ class TaskManager:
         return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts)
 
     def manifest(self, skill: str) -> SkillManifest:
-        """Return a skill's manifest; the validator has made sure that it is there."""
-        return self._catalogue.skills[skill]
+        """Return a skill's manifest; NotFoundError when this gateway does not know it (another may)."""
+        if (found := self._catalogue.skills.get(skill)) is None:
+            raise NotFoundError(
+                f"{self.plane.gateway} has no skill {clean(skill, 80)!r}", remedy="give all gateways the same skills"
+            )
+        return found
 
     def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
         """Choose the robot of a subtask."""
-        manifests = {each.subtask.id: self.manifest(each.subtask.skill) for each in record.subtasks}
+        skills = self._catalogue.skills
+        manifests = {
+            each.subtask.id: skills[each.subtask.skill] for each in record.subtasks if each.subtask.skill in skills
+        }
         return bind(
             target.subtask.robot or "",
             record.subtasks,
@@ -327,15 +375,15 @@ class TaskManager:
         stored = await self.plane.dht.read(task_key(check_name(ask.id, "task")))
         if stored is None or stored.deleted:
             raise NotFoundError(f"there is no task {ask.id}", remedy="see `swiftbot task list`")
-        return msgspec.json.decode(stored.value, type=TaskRecord)
+        return read_record(stored.value)
 
     async def tasks(self, ask: TasksAsk) -> TaskList:
         """Return the newest tasks, of the whole fleet or of this gateway's shard."""
         found: dict[str, TaskRecord] = {}
         for stored in await self.plane.dht.local("task/"):
             if not stored.deleted:
-                with contextlib.suppress(msgspec.DecodeError):
-                    record = msgspec.json.decode(stored.value, type=TaskRecord)
+                with contextlib.suppress(PayloadError):
+                    record = read_record(stored.value)
                     found[record.id] = record
         for driver in self._drivers.values():
             found[driver.record.id] = driver.record

@@ -7,12 +7,16 @@ draining, cannot start containers and has none ready, or failed this subtask bef
 candidate. Ties go to the gateway that asks: it is a network hop nearer.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from msgspec import Struct
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, SubtaskRecord
 from appliance.tasks.settings import TasksConfig
+
+_ANY = re.compile(r"any\d{0,2}")
+"""Labels for a robot to be chosen; a robot may be called `anymal_1`."""
 
 
 class Placement(Struct, frozen=True, kw_only=True):
@@ -100,7 +104,7 @@ def bind(
     Returns:
         The robot and "", or None and the reason for the wait.
     """
-    if not label.startswith("any"):
+    if not _ANY.fullmatch(label):
         robot = robots.get(label)
         if robot is None or not robot.online:
             return None, f"waits for {label}: {'offline' if robot else 'not in the roster'}"
@@ -108,6 +112,9 @@ def bind(
     mine = [each for each in records if each.subtask.robot == label]
     for each in mine:
         if each.bound_robot:
+            bound = robots.get(each.bound_robot)
+            if bound is None or not bound.online:
+                return None, f"waits for {each.bound_robot}: {'offline' if bound else 'not in the roster'}"
             return each.bound_robot, ""
     taken = {each.bound_robot for each in records if each.bound_robot}
     named = {each.subtask.robot for each in records if each.subtask.robot}

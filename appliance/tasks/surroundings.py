@@ -7,6 +7,7 @@ from msgspec import Struct
 from appliance.model import Need, Plan, RunAccepted, RunEvent, RunRequest, SubtaskRecord, TaskRecord
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.bounds import MAX_RUN_S
 from appliance.tasks.placement import Placement
 from appliance.tasks.settings import TasksConfig
 
@@ -22,7 +23,7 @@ class Surroundings(Protocol):
         ...
 
     def manifest(self, skill: str) -> SkillManifest:
-        """Return a skill's manifest."""
+        """Return a skill's manifest; NotFoundError when this gateway does not know it."""
         ...
 
     def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
@@ -74,6 +75,8 @@ def need_of(manifest: SkillManifest) -> Need:
 
 
 def deadline_s(manifest: SkillManifest, params: dict[str, Any]) -> float:
-    """Time a run may take: the skill's own, beyond the duration that was asked for."""
+    """Time a run may take: the skill's own, beyond the duration that was asked for (within bounds)."""
     asked = params.get("duration_s", 0.0)
-    return manifest.timeout_s + (float(asked) if isinstance(asked, int | float) else 0.0)
+    # Compared before it becomes a float: an integer of a plan may be too large for one.
+    extra = min(MAX_RUN_S, max(0.0, asked)) if isinstance(asked, int | float) and asked == asked else 0.0  # noqa: PLR0124 - not a number
+    return manifest.timeout_s + float(extra)

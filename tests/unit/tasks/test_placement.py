@@ -125,3 +125,26 @@ def test_an_absent_robot_is_waited_for_by_name() -> None:
     robot, reason = bind("rover_9", these, robots=ROBOTS, uses={}, verbs={}, busy=frozenset())
     assert robot is None
     assert "rover_9" in reason
+
+
+def test_a_robot_called_anymal_is_a_named_robot() -> None:
+    """Only `any`, `any1`, ... are labels; what merely begins so is a name, and is waited for by name."""
+    records = [SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="anymal_1"))]
+    dog, other = RobotInfo(id="anymal_1", kind="zenoh"), RobotInfo(id="aaa", kind="zenoh")
+    roster = {"aaa": other, "anymal_1": dog}
+    assert bind("anymal_1", records, robots=roster, uses={}, verbs={}, busy=frozenset()) == ("anymal_1", "")
+    chosen, why = bind("anymal_1", records, robots={"aaa": other}, uses={}, verbs={}, busy=frozenset())
+    assert chosen is None
+    assert "anymal_1" in why
+
+
+def test_a_bound_robot_that_went_offline_is_waited_for() -> None:
+    """A label means one robot throughout: while that one is away its subtasks wait, and say for whom."""
+    records = [
+        SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="any"), bound_robot="rover_1"),
+        SubtaskRecord(subtask=Subtask(id="s2", skill="goto", robot="any")),
+    ]
+    away = RobotInfo(id="rover_1", kind="zenoh", online=False)
+    chosen, why = bind("any", records, robots={"rover_1": away}, uses={}, verbs={}, busy=frozenset())
+    assert chosen is None
+    assert why == "waits for rover_1: offline"
