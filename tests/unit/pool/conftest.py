@@ -162,6 +162,17 @@ def catalogue(skills_dir: Path) -> Catalogue:
     return Catalogue(whole.domains, skills, images)
 
 
+def children_of(parent: int) -> list[int]:
+    """Return the processes that a process has started itself."""
+    found: list[int] = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            # The name before the last bracket may hold anything; after it come the state and the parent.
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(stat.parent.name))
+    return found
+
+
 class FakeEngine:
     """The seam to Podman, with the runner as a plain process for a container."""
 
@@ -231,7 +242,14 @@ class FakeEngine:
         process = self.processes.pop(container, None)
         if process is not None:
             with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGSTOP)  # so that it starts nothing more
+                runs = children_of(process.pid)
                 process.kill()
+                # In a container the kernel ends all others with process 1.
+                for run in runs:
+                    for kill in (os.killpg, os.kill):
+                        with contextlib.suppress(ProcessLookupError):
+                            kill(run, signal.SIGKILL)
             await process.wait()
 
     async def logs(self, container: str) -> str:
