@@ -35,7 +35,8 @@ NEED_AGAIN_MB=300
 CERTIFICATES=/etc/ssl/certs/ca-certificates.crt
 
 LOG=$(mktemp "${TMPDIR:-/tmp}/swiftbot-setup.XXXXXX")
-trap 'rm -f "$LOG"' EXIT
+SCRATCH=
+trap 'rm -rf "$LOG" ${SCRATCH:+"$SCRATCH"}' EXIT
 
 elapsed() {
   local ms=$((($(date +%s%N) - START) / 1000000))
@@ -297,7 +298,9 @@ make_environment() {
     make_tools
     say "environment: packages of locks/$lock.txt"
     rm -f "$STATE/package"  # the package is not in the lock, so a sync takes it out
-    quiet "environment: packages" "see the lines above" "$TOOLS/bin/uv" pip sync --quiet --require-hashes \
+    # Builds of packages without a wheel leave a lock file in the folder for temporary files: they get their own.
+    SCRATCH=$(mktemp -d "$STATE/tmp.XXXXXX")
+    quiet "environment: packages" "see the lines above" env "TMPDIR=$SCRATCH" "$TOOLS/bin/uv" pip sync --quiet --require-hashes \
       --python "$VENV/bin/python" "$PROJECT/locks/$lock.txt"
     echo "$want" >"$STATE/environment"
     say "environment: done"
