@@ -9,6 +9,7 @@ import asyncio
 import os
 import signal
 import sys
+import uuid
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,10 +17,11 @@ from typing import Annotated, Any
 import msgspec
 import uvloop
 from cyclopts import App, CycloptsError, Group, Parameter
+from rich.markup import escape
 
 from appliance import console, logs, service
 from appliance.client import Endpoint, FleetClient
-from appliance.errors import ConfigError, SwiftbotError
+from appliance.errors import ConfigError, NotFoundError, SwiftbotError
 from appliance.model import TaskRecord, TaskRequest, TaskState
 from appliance.tasks.view import view
 
@@ -326,21 +328,24 @@ def submit(
     """Hand in an instruction; without --wait it returns when the task is planned."""
     from appliance.demo import follow
 
+    # The id is chosen here: an interrupt while the task is being handed in must know what to cancel.
+    request = TaskRequest(instruction=text, id=task_id or f"t-{uuid.uuid4().hex[:10]}", submitter=_me())
+
     async def go() -> TaskRecord:
         async with FleetClient(where.endpoint()) as client:
-            accepted = await client.submit(TaskRequest(instruction=text, id=task_id, submitter=_me()))
-            console.err.print(f"task {accepted.id} is accepted")
-            if not wait:
-                return await client.planned(accepted.id)
             try:
+                accepted = await client.submit(request)
+                console.err.print(f"task {accepted.id} is accepted")
+                if not wait:
+                    return await client.planned(accepted.id)
                 if not as_json:
                     return await follow(client, accepted.id)
                 last = accepted
                 async for record in client.watch(accepted.id):
                     last = record
             except asyncio.CancelledError:
-                console.err.print(f"cancelling task {accepted.id}")
-                await asyncio.shield(client.cancel(accepted.id))
+                if wait:
+                    await _cancel(client, request.id)
                 raise
             return last
 
@@ -348,6 +353,17 @@ def submit(
     if as_json or not wait:
         show(view(record), as_json=as_json, table=console.task_table(record))
     return _outcome(record)
+
+
+async def _cancel(client: FleetClient, task: str) -> None:
+    """Cancel a task after an interrupt; that it cannot be done is said, and the command still ends as interrupted."""
+    console.err.print(f"cancelling task {task}")
+    try:
+        await client.cancel(task)
+    except NotFoundError:
+        console.err.print(f"task {task} had not been accepted")
+    except SwiftbotError as error:
+        console.err.print(f"task {task} may go on: {error}", markup=False)
 
 
 def _outcome(record: TaskRecord) -> int:
@@ -587,7 +603,8 @@ def main(arguments: list[str] | None = None) -> None:
     except CycloptsError:
         code = 2
     except SwiftbotError as error:
-        console.err.print(f"[red]error:[/red] {error.message}", markup=True)
+        # Messages hold what people and robots wrote: brackets in them are no markup.
+        console.err.print(f"[red]error:[/red] {escape(error.message)}", markup=True)
         if error.remedy:
             console.err.print(f"  remedy: {error.remedy}", markup=False)
         code = error.exit_code

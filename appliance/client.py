@@ -33,6 +33,18 @@ class Endpoint(Struct, frozen=True, kw_only=True):
     connect: tuple[str, ...]
 
 
+def _news(last: TaskRecord, record: TaskRecord) -> bool:
+    """Whether a record tells more than the last one shown.
+
+    A coordinator that comes later, be it the same gateway after a restart, goes on from the last *written* record,
+    so that its transitions may be numbered lower than what was pushed before. Within one coordinator its own clock
+    orders; an end is always news.
+    """
+    if record.state.final or record.coordinator != last.coordinator:
+        return True
+    return record.sequence > last.sequence or record.updated_ns > last.updated_ns
+
+
 class FleetClient:
     """A connection to a fleet; use it as an async context manager."""
 
@@ -131,7 +143,7 @@ class FleetClient:
                         if silent > 30:
                             raise
                         continue
-                if last is None or record.sequence > last.sequence or record.coordinator != last.coordinator:
+                if last is None or _news(last, record):
                     last = record
                     yield record
         finally:

@@ -38,6 +38,8 @@ from appliance.tasks.retention import Retention
 log = structlog.get_logger(__name__)
 
 VERSION = "0.1.0"
+MOST_HANDED_IN = 64
+"""Tasks of robots on their way at once; a robot that asks faster is refused, and counted."""
 
 
 class Gateway:
@@ -51,7 +53,9 @@ class Gateway:
         self._process = psutil.Process()
         self._changed = asyncio.Event()
         self._draining = False
-        self._ready = False
+        self._ready = asyncio.Event()
+        """Tasks can be handed in."""
+        self._handing_in: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -129,6 +133,8 @@ class Gateway:
         self.manager.on_change = self._changed.set
         await self.manager.start()
         self._stack.push_async_callback(self.manager.stop)
+        self._ready.set()
+        self._stack.callback(self._drop_intake)
         self._publish_status()
         for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
             self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
@@ -163,8 +169,10 @@ class Gateway:
         self.executor.draining = True
         self._publish_status()
         log.info("gateway drains", runs=self.executor.running, deadline_s=self.config.drain_s)
-        await self.executor.drain(self.config.drain_s)
-        await self._stack.aclose()
+        try:
+            await self.executor.drain(self.config.drain_s)
+        finally:
+            await self._stack.aclose()
 
     # --- facts about this gateway ---------------------------------------------------------------------------
 
@@ -182,15 +190,31 @@ class Gateway:
         """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""
         if self.plane.ring.owner(f"robot/{robot}") != self.config.id:
             return
-        handing_in = asyncio.ensure_future(self._hand_in(robot, request))
-        handing_in.add_done_callback(lambda done: done.exception())
+        if len(self._handing_in) >= MOST_HANDED_IN:
+            self._refuse_intake(robot, f"{MOST_HANDED_IN} tasks of robots are being handed in")
+            return
+        handing_in = asyncio.create_task(self._hand_in(robot, request), name=f"task of {robot}")
+        self._handing_in.add(handing_in)
+        handing_in.add_done_callback(self._handing_in.discard)
 
     async def _hand_in(self, robot: str, request: TaskRequest) -> None:
+        # Robots are heard before the task manager is there.
+        await self._ready.wait()
         try:
             await self.manager.submit(msgspec.structs.replace(request, submitter=request.submitter or robot))
         except SwiftbotError as error:
-            self.plane.session.refused["robot task"] = self.plane.session.refused.get("robot task", 0) + 1
-            log.warning("a robot's task is refused", robot=robot, reason=str(error))
+            self._refuse_intake(robot, str(error))
+        except Exception as error:  # the boundary to what a robot sent: it is told in the log, and counted
+            log.exception("a robot's task broke", robot=robot)
+            self._refuse_intake(robot, f"{type(error).__name__}: {error}")
+
+    def _refuse_intake(self, robot: str, reason: str) -> None:
+        self.plane.session.refused["robot task"] = self.plane.session.refused.get("robot task", 0) + 1
+        log.warning("a robot's task is refused", robot=robot, reason=reason)
+
+    def _drop_intake(self) -> None:
+        for handing_in in self._handing_in:
+            handing_in.cancel()
 
     def status(self) -> GatewayStatus:
         """This gateway's account of itself."""
@@ -228,7 +252,10 @@ class Gateway:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), timeout=self.config.status_s)
             self._changed.clear()
-            self._publish_status()
+            try:
+                self._publish_status()
+            except Exception:  # a figure that cannot be read once must not silence this gateway for good
+                log.exception("status could not be published")
             await asyncio.sleep(0.05)
 
 
@@ -248,8 +275,11 @@ async def run(config: GatewayConfig) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.remove_signal_handler(number)
         service.stopping()
-        watchdog.cancel()
-        await gateway.stop()
+        try:
+            await gateway.stop()
+        finally:
+            # Draining takes a while, in which the loop must go on being seen to turn.
+            watchdog.cancel()
 
 
 async def _watchdog() -> None:

@@ -6,6 +6,7 @@ time, so that `down` ends exactly those, and commands find the endpoints.
 """
 
 import asyncio
+import contextlib
 import os
 import signal
 import socket
@@ -142,10 +143,18 @@ async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> Fl
         )
     starting = _Starting(order)
     try:
-        state = starting.start_all(progress)
+        try:
+            state = starting.start_all(progress)
+        except OSError as error:
+            raise ConfigError(
+                f"{error.filename or directory} cannot be written: {error.strerror}",
+                remedy="give a writable --dir with space left",
+            ) from error
         await _wait_ready(state, order, progress, timeout_s)
     except BaseException:
         await _end(starting.processes, grace_s=10.0)
+        if starting.processes:
+            await remove_containers(order.fleet, progress=progress)
         raise
     return state
 
@@ -337,10 +346,9 @@ async def down(directory: Path, *, progress: Progress, grace_s: float = 30.0) ->
         NotFoundError: none was started there.
     """
     state = read_state(directory)
-    order = sorted(state.processes, key=lambda each: (each.name in state.gateways, each.name == "recorder"))
-    robots = [each for each in order if each.name in state.robots]
-    gateways = [each for each in order if each.name in state.gateways]
-    rest = [each for each in order if each not in robots and each not in gateways]
+    robots = [each for each in state.processes if each.name in state.robots]
+    gateways = [each for each in state.processes if each.name in state.gateways]
+    rest = [each for each in state.processes if each not in robots and each not in gateways]
     for group, what in ((robots, "robots"), (gateways, "gateways"), (rest, "recorder")):
         if group:
             progress(f"stopping {what}")
@@ -366,17 +374,22 @@ async def remove_containers(fleet: str, *, progress: Progress) -> None:
 async def _end(processes: list[Process], *, grace_s: float) -> None:
     """SIGTERM, wait, SIGKILL; only the very processes that were started."""
     for process in processes:
-        if alive(process):
-            os.kill(process.pid, signal.SIGTERM)
+        _signal(process, signal.SIGTERM)
     until = time.monotonic() + grace_s
     while time.monotonic() < until and any(alive(each) for each in processes):
         _reap(processes)
         await asyncio.sleep(0.05)
     for process in processes:
-        if alive(process):
-            os.kill(process.pid, signal.SIGKILL)
+        _signal(process, signal.SIGKILL)
     await asyncio.sleep(0.05)
     _reap(processes)
+
+
+def _signal(process: Process, number: signal.Signals) -> None:
+    """Signal that very process; one that ends just now needs none."""
+    if alive(process):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.pid, number)
 
 
 def _reap(processes: list[Process]) -> None:

@@ -211,6 +211,8 @@ class FakeRing:
 class FakePlane:
     """A plane in memory."""
 
+    plan_of: Callable[..., Plan]
+
     def __init__(self, gateway: str = "gw-1") -> None:
         self.gateway = gateway
         self.session = FakeSession()
@@ -226,6 +228,10 @@ class FakePlane:
     def members(self) -> frozenset[str]:
         """Return who is there."""
         return frozenset(self.present)
+
+    def accepted(self, task: str = "t-1", plan: Plan | None = None) -> TaskRecord:
+        """Return a record just accepted here."""
+        return accepted(task, plan, self.gateway)
 
 
 class FakePool:
@@ -276,6 +282,9 @@ CATALOGUE = cast("Catalogue", type("C", (), {"skills": {"work": manifest()}, "do
 def plan_of(*subtasks: Subtask) -> Plan:
     """Return a plan; by default of one subtask s1."""
     return Plan(domain="any", subtasks=subtasks or (Subtask(id="s1", skill="work"),))
+
+
+FakePlane.plan_of = staticmethod(plan_of)
 
 
 def accepted(task: str = "t-1", plan: Plan | None = None, coordinator: str = "gw-1") -> TaskRecord:
@@ -416,3 +425,21 @@ def plane() -> FakePlane:
 def folder(tmp_path: Path) -> Path:
     """Return a folder for files."""
     return tmp_path
+
+
+@pytest.fixture
+def pool() -> FakePool:
+    """Return a pool that does what the test says."""
+    return FakePool()
+
+
+@pytest.fixture
+def tasks_config() -> TasksConfig:
+    """Return a configuration with short waits."""
+    return FAST
+
+
+@pytest.fixture
+def catalogue() -> Catalogue:
+    """Return a catalogue with one skill, `work`."""
+    return CATALOGUE

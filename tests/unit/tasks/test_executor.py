@@ -1,0 +1,202 @@
+"""Runs on one gateway, on a fake pool: orders that come twice, too late or while draining, and their outcomes."""
+
+import asyncio
+from typing import Any, cast
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from appliance.errors import DeadlineError, PayloadError, RefusedError, UnreachableError
+from appliance.model import (
+    Need,
+    Phase,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
+    TaskState,
+    encode,
+)
+from appliance.pool.selection import Decision
+from appliance.tasks.api import RunAsk
+from appliance.tasks.executor import Executor
+
+pytestmark = pytest.mark.anyio
+
+REQUEST = RunRequest(task="t-1", subtask="s1", attempt=1, skill="work", need=Need(image="base"))
+ASK = RunAsk(task="t-1", subtask="s1", attempt=1)
+AWAY = Decision(phase=Phase.REMOTE_WARM, gateway="gw-2", container="c2")
+
+
+@pytest.fixture
+async def executor(plane: Any, pool: Any, tasks_config: Any) -> Executor:
+    """Return an executor that hears records."""
+    made = Executor(plane, pool, tasks_config)
+    await made.start()
+    return made
+
+
+async def finish(pool: Any, run_id: str = "t-1/s1/1", **fields: Any) -> None:
+    """End a run with a success."""
+    async with asyncio.timeout(5):
+        while run_id not in pool.runs:
+            await asyncio.sleep(0.001)
+    task, subtask, attempt = run_id.split("/")
+    pool.runs[run_id].set_result(
+        RunEvent(task=task, subtask=subtask, attempt=int(attempt), kind=RunEventKind.SUCCEEDED, **fields)
+    )
+
+
+async def last_event(plane: Any) -> RunEvent:
+    """Wait for the final event that is told."""
+    async with asyncio.timeout(5):
+        while True:
+            told = plane.session.sent(plane.keys.run("t-1", "s1"), RunEvent)
+            if told and told[-1].kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+                return told[-1]
+            await asyncio.sleep(0.001)
+
+
+async def test_an_order_that_comes_twice_runs_once(executor: Executor, plane: Any, pool: Any) -> None:
+    """Also while the first is still being decided on: both get the same answer, and nothing fails."""
+    pool.gate = asyncio.Event()
+    orders = [asyncio.create_task(executor.run(REQUEST)) for _ in range(2)]
+    await asyncio.sleep(0.01)
+    assert (await executor.status(ASK)).running
+    pool.gate.set()
+    one, other = await asyncio.gather(*orders)
+    assert one == other == await executor.run(REQUEST)
+    assert executor.running == 1
+    await finish(pool, result={"ok": 1})
+    assert (await last_event(plane)).result == {"ok": 1}
+
+
+@pytest.mark.parametrize("why", ["drain", "cancel", "newer attempt"])
+async def test_an_order_overtaken_while_it_is_decided_on_does_not_begin(
+    executor: Executor, pool: Any, why: str
+) -> None:
+    """Draining, a cancel or a newer attempt that comes during the selection is heeded after it."""
+    pool.gate = asyncio.Event()
+    order = asyncio.create_task(executor.run(REQUEST))
+    await asyncio.sleep(0.01)
+    if why == "drain":
+        await executor.drain(0.1)
+    elif why == "cancel":
+        await executor.cancel(ASK)
+    else:
+        newer = asyncio.create_task(executor.run(replace(REQUEST, attempt=2)))
+        await asyncio.sleep(0.01)
+    pool.gate.set()
+    with pytest.raises(RefusedError):
+        await order
+    if why == "newer attempt":
+        assert (await newer).gateway == "gw-1"
+    assert "t-1/s1/1" not in pool.runs
+
+
+async def test_an_order_is_passed_on_once(executor: Executor, plane: Any, pool: Any) -> None:
+    """The gateway with the warm container answers; what was passed on is not passed on again."""
+
+    async def take(gateway: str, request: RunRequest) -> RunAccepted:
+        assert request.hops == 1
+        return RunAccepted(gateway=gateway, container="c2", phase=Phase.REMOTE_WARM)
+
+    plane.rpc.on["run"] = take
+    pool.decisions = [AWAY]
+    assert (await executor.run(REQUEST)).gateway == "gw-2"
+    assert executor.running == 0
+    pool.decision = Decision(phase=Phase.COLD, gateway="gw-1")
+    with pytest.raises(RefusedError, match="no ready container"):
+        await executor.run(replace(REQUEST, subtask="s2", hops=1))
+
+
+async def test_a_pass_on_without_an_answer_is_not_run_here_as_well(executor: Executor, plane: Any, pool: Any) -> None:
+    """It may run there: the same attempt in two places is refused, and a new attempt left to the coordinator."""
+
+    async def silent(gateway: str, request: RunRequest) -> RunAccepted:
+        raise DeadlineError("no answer")
+
+    plane.rpc.on["run"] = silent
+    pool.decisions = [AWAY]
+    with pytest.raises(UnreachableError):
+        await executor.run(REQUEST)
+    assert executor.running == 0
+
+
+async def test_a_pass_on_to_a_lost_gateway_falls_back_to_here(executor: Executor, pool: Any) -> None:
+    """Nobody there took it: what is left is here."""
+    pool.decisions = [AWAY]
+    assert (await executor.run(REQUEST)).gateway == "gw-1"
+
+
+@pytest.mark.parametrize("result", [{"x": "y" * 60_000}, {"text": "\ud800"}, "deep"])
+async def test_results_that_no_record_can_hold_fail_the_run(
+    executor: Executor, plane: Any, pool: Any, result: Any
+) -> None:
+    """Oversize, not writable as JSON, nested without end: told as a failure, never silence."""
+    if result == "deep":
+        result = {}
+        for _ in range(5000):
+            result = {"a": result}
+    await executor.run(REQUEST)
+    await finish(pool, result=result)
+    final = await last_event(plane)
+    assert final.kind is RunEventKind.FAILED
+    assert final.failure is not None
+    assert final.failure.code == "payload"
+
+
+async def test_an_outcome_is_told_although_it_cannot_be_kept(executor: Executor, plane: Any, pool: Any) -> None:
+    """A full disk does not hide a success."""
+    plane.store.problem = RefusedError("the disk is full")
+    await executor.run(REQUEST)
+    await finish(pool, result={})
+    assert (await last_event(plane)).kind is RunEventKind.SUCCEEDED
+
+
+async def test_orders_with_impossible_names_or_numbers_are_refused(executor: Executor) -> None:
+    """Forged orders leave nothing behind."""
+    for wrong in (
+        {"task": "../x"},
+        {"subtask": "a/b"},
+        {"attempt": 0},
+        {"deadline_s": 1e300},
+        {"deadline_s": -1.0},
+    ):
+        with pytest.raises(PayloadError):
+            await executor.run(replace(REQUEST, **cast("Any", wrong)))
+    assert not executor._attempts
+
+
+async def test_a_run_is_ended_when_its_task_moves_on_or_ends(executor: Executor, plane: Any, pool: Any) -> None:
+    """The record is the word: a run of a task that has ended is cancelled, also while this gateway drains."""
+    await executor.run(REQUEST)
+    await asyncio.sleep(0.01)
+    draining = asyncio.create_task(executor.drain(5.0))
+    await asyncio.sleep(0.01)
+    record = plane.accepted()
+    plane.session.put(plane.keys.task("t-1"), encode(replace(record, state=TaskState.CANCELLED)))
+    await asyncio.sleep(0.01)
+    assert pool.cancelled == ["t-1/s1/1"]
+    await finish(pool)
+    await asyncio.wait_for(draining, 5)
+    with pytest.raises(RefusedError, match="draining"):
+        await executor.run(replace(REQUEST, subtask="s2"))
+
+
+async def test_a_restart_tells_of_lost_runs_and_skips_what_it_cannot_read(
+    plane: Any, pool: Any, tasks_config: Any
+) -> None:
+    """A run in progress at the end has failed, retryable; a damaged row does not keep the gateway from starting."""
+    begun = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.STARTED)
+    plane.store.values = {"run/t-1/s1/1": encode(begun), "run/t-1/s2/1": b"\xff"}
+    executor = Executor(plane, pool, tasks_config)
+    await executor.start()
+    status = await executor.status(ASK)
+    assert not status.running
+    assert status.last is not None
+    assert status.last.failure is not None
+    assert status.last.failure.retryable
+    assert "run/t-1/s2/1" not in plane.store.values
+    assert msgspec.json.decode(plane.store.values["run/t-1/s1/1"], type=RunEvent).kind is RunEventKind.FAILED
