@@ -1,0 +1,182 @@
+"""Accepting, taking over and answering on fakes: what must not be lost, refused or driven twice."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any, cast
+
+import pytest
+from msgspec.structs import replace
+
+from appliance.client import _news
+from appliance.errors import DeadlineError, PayloadError, UnreachableError
+from appliance.model import RunEvent, RunEventKind, Site, Subtask, TaskRequest, TaskState, encode
+from appliance.plane.dht import Record
+from appliance.tasks import manager as module
+from appliance.tasks.api import TaskAsk
+from appliance.tasks.manager import TaskManager
+
+pytestmark = pytest.mark.anyio
+
+
+class FakeExecutor:
+    """Takes no order."""
+
+    async def run(self, request: object) -> object:
+        """Never answer."""
+        await asyncio.Event().wait()
+        return request
+
+
+@pytest.fixture
+async def manager(
+    plane: Any, tasks_config: Any, catalogue: Any, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[TaskManager]:
+    """Return a started manager without gateways, so that tasks wait; stopped afterwards."""
+    monkeypatch.setattr(module, "validate", lambda *_, **__: ())
+    made = TaskManager(
+        tasks_config,
+        plane=plane,
+        catalogue=catalogue,
+        decomposer=cast("Any", None),
+        executor=cast("Any", FakeExecutor()),
+        site=Site(),
+    )
+    await made.start()
+    yield made
+    await made.stop()
+
+
+def wish(plane: Any, task: str = "t-1") -> TaskRequest:
+    """Return a request with a plan of one subtask."""
+    return TaskRequest(instruction="work", id=task, plan=plane.plan_of())
+
+
+async def until(holds: Any) -> None:
+    """Wait until something holds."""
+    async with asyncio.timeout(5):
+        while not holds():
+            await asyncio.sleep(0.005)
+
+
+async def test_a_known_id_is_the_same_task_and_is_driven(manager: TaskManager, plane: Any) -> None:
+    """A first try whose answer was lost left a record that nobody drives: the second try sees to it."""
+    await plane.dht.write("task/t-1", encode(plane.accepted(plan=plane.plan_of())), expected=None)
+    await asyncio.sleep(0.02)
+    assert (await manager.submit(wish(plane))).id == "t-1"
+    await until(lambda: manager.unfinished == 1)
+
+
+async def test_an_undriven_task_is_taken_up_without_a_ring_change(
+    manager: TaskManager, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A record that came after the last sweep is found by the regular look."""
+    monkeypatch.setattr(module, "SWEEP_S", 0.02)
+    manager._sweep.set()
+    await asyncio.sleep(0.02)
+    await plane.dht.write("task/t-1", encode(plane.accepted(plan=plane.plan_of())), expected=None)
+    await until(lambda: manager.unfinished == 1)
+
+
+async def test_a_broken_sweep_and_poisoned_records_do_not_end_takeover(manager: TaskManager, plane: Any) -> None:
+    """Records nested beyond decoding and a store that breaks are survived."""
+    deep = b"[" * 100_000
+    poison = (
+        b'{"id":"t-9","instruction":"x","plan":{"domain":"a","subtasks":[{"id":"s1","skill":"w","params":{"x":' + deep
+    )
+    plane.dht.records["task/t-9"] = Record(key="task/t-9", value=poison, version={"x": 1})
+    manager._sweep.set()
+    await asyncio.sleep(0.02)
+    working = plane.dht.local
+
+    async def broken(prefix: str) -> list[Any]:
+        raise OSError("the disk is gone")
+
+    plane.dht.local = broken
+    manager._sweep.set()
+    await asyncio.sleep(0.02)
+    plane.dht.local = working
+    await plane.dht.write("task/t-1", encode(plane.accepted(plan=plane.plan_of())), expected=None)
+    manager._sweep.set()
+    await until(lambda: manager.unfinished == 1)
+
+
+async def test_a_key_that_is_anothers_is_let_go(manager: TaskManager, plane: Any) -> None:
+    """The ring changes: the driver here ends, the record stays."""
+    await manager.submit(wish(plane))
+    plane.dht.mine = False
+    manager._sweep.set()
+    await until(lambda: manager.unfinished == 0)
+    assert "task/t-1" in plane.dht.records
+
+
+async def test_a_task_whose_end_could_not_be_written_is_driven_again(manager: TaskManager, plane: Any) -> None:
+    """Final in memory is not final: the next driver cancels it again and writes that."""
+    await manager.submit(wish(plane))
+    await until(lambda: manager._drivers["t-1"].record.state is TaskState.RUNNING)
+    await asyncio.sleep(0.05)
+    plane.dht.break_next = [UnreachableError("no owner")]
+    await manager.cancel(TaskAsk(id="t-1"))
+    await until(lambda: manager.unfinished == 0)
+    await until(lambda: manager.unfinished == 1)
+
+
+async def test_a_driver_that_breaks_again_and_again_ends_its_task_with_the_reason(
+    manager: TaskManager, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No task is retried for ever without a word."""
+    monkeypatch.setattr(module, "MAX_BREAKS", 1)
+    await manager.submit(wish(plane))
+    plane.dht.break_next = [PayloadError("the record is too large")]
+    async with asyncio.timeout(5):
+        while not (record := await manager.task(TaskAsk(id="t-1"))).state.final:
+            await asyncio.sleep(0.02)
+    assert record.state is TaskState.FAILED
+    assert record.failure is not None
+    assert "too large" in record.failure.message
+
+
+async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, plane: Any) -> None:
+    """Events of gateways that are not there, or under another task's key, reach no driver."""
+    await manager.submit(wish(plane))
+    event = RunEvent(task="t-1", subtask="s1", attempt=0, kind=RunEventKind.SUCCEEDED, gateway="evil")
+    plane.session.put(plane.keys.run("t-1", "s1"), encode(event))
+    plane.session.put(plane.keys.run("t-2", "s1"), encode(replace(event, gateway="gw-1")))
+    assert plane.session.refused == {"forged run event": 2}
+
+
+async def test_hostile_requests_are_refused_with_a_reason(manager: TaskManager, plane: Any) -> None:
+    """Endless names, deep parameters, bad ids: nothing is written."""
+    deep: Any = 1
+    for _ in range(200):
+        deep = [deep]
+    plan = plane.plan_of(Subtask(id="s1", skill="work", params={"x": deep}))
+    for request in (
+        TaskRequest(instruction=" "),
+        TaskRequest(instruction="x" * 5000),
+        TaskRequest(instruction="x", id="../../etc"),
+        TaskRequest(instruction="x", submitter="s" * 10_000),
+        TaskRequest(instruction="x", plan=plan),
+    ):
+        with pytest.raises(PayloadError):
+            await manager.submit(request)
+    assert not plane.dht.records
+
+
+async def test_a_silent_owner_is_asked_again_and_then_its_successor(manager: TaskManager, plane: Any) -> None:
+    """Submission survives the death of the key's owner."""
+
+    async def silent(gateway: str, request: object) -> object:
+        plane.ring.name = "gw-1"
+        raise DeadlineError("no answer")
+
+    plane.ring.name = "gw-2"
+    plane.rpc.on["accept"] = silent
+    assert (await manager.submit(wish(plane))).coordinator == "gw-1"
+
+
+def test_a_watcher_follows_a_coordinator_that_came_back_with_lower_numbers(plane: Any) -> None:
+    """After a restart the same gateway goes on from the written record; its end must not be overlooked."""
+    pushed = replace(plane.accepted(), sequence=50, updated_ns=100)
+    assert _news(pushed, replace(pushed, sequence=12, updated_ns=200))
+    assert _news(pushed, replace(pushed, sequence=20, state=TaskState.SUCCEEDED))
+    assert not _news(pushed, replace(pushed, sequence=40, updated_ns=90))
