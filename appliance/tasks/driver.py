@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import structlog
 
-from appliance.errors import ConflictError, NotFoundError, PlanError, SwiftbotError
+from appliance.errors import NotFoundError, PlanError, SwiftbotError
 from appliance.model import (
     Failure,
     Plan,
@@ -27,12 +27,12 @@ from appliance.model import (
     TaskRecord,
     TaskState,
     VersionVector,
-    encode,
 )
 from appliance.tasks import machine
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.bounds import MAX_RUN_S, clean, read_record, tidy
-from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.bounds import MAX_RUN_S, clean, tidy
+from appliance.tasks.keeper import Keeper, SupersededError
+from appliance.tasks.machine import TransitionKind
 from appliance.tasks.surroundings import (
     CancelAsked,
     GatewayLost,
@@ -42,7 +42,6 @@ from appliance.tasks.surroundings import (
     Wake,
     deadline_s,
     need_of,
-    task_key,
 )
 
 log = structlog.get_logger(__name__)
@@ -51,13 +50,7 @@ MAX_INBOX = 1000
 """News that may wait for a driver; beyond it progress is dropped, beyond twice that what checks find out anyway."""
 
 
-class SupersededError(SwiftbotError):
-    """Another gateway coordinates the task now."""
-
-    code = "superseded"
-
-
-class Driver:
+class Driver(Keeper):
     """Drives one task. `run` ends when the task has ended or another gateway has taken over."""
 
     def __init__(
@@ -70,16 +63,12 @@ class Driver:
         give_up: Failure | None = None,
     ) -> None:
         self._around = around
-        self._plane = around.plane
-        self.record = record
-        self._version = version
-        self._on_change = on_change
+        super().__init__(around.plane, record, version, on_change)
         self.ended = False
         """Whether the task has ended and its last record is written; one that is final only here has not."""
         self._give_up = give_up
         """Why the task is to be ended instead of driven: earlier drivers of it broke."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
-        self._ready_ns: dict[str, int] = {}
         self._not_before: dict[str, float] = {}
         self._sent_at: dict[str, float] = {}
         self._waiting: dict[str, str] = {}
@@ -87,9 +76,7 @@ class Driver:
         self._cancelled_at: float | None = None
         self._cancel_at: dict[str, float] = {}
         self._check_at = time.monotonic() + around.config.check_s
-        self._pending: list[Transition] = []
         self._outgoing: list[tuple[str, RunRequest]] = []
-        self._dirty = False
 
     @property
     def waits(self) -> bool:
@@ -363,11 +350,6 @@ class Driver:
             case RunEventKind.LOG | RunEventKind.PARTIAL:
                 pass
 
-    def _take(self, transition: Transition, *, durable: bool = True) -> bool:
-        if fits := machine.fits(self.record, transition):
-            self._apply(transition, durable=durable)
-        return fits
-
     def _attempt_failed(self, target: SubtaskRecord, failure: Failure, duration_ms: float | None) -> None:
         judged = _with_failure(target, failure)
         give_up = machine.gives_up(judged, failure, retries=self._retries(target) + 1)
@@ -453,73 +435,18 @@ class Driver:
             log.info("no word of a run", run=ask.run_id, gateway=target.gateway, reason=str(error))
             return None
 
-    # --- the record ----------------------------------------------------------------------------------------
+    # --- orders ---------------------------------------------------------------------------------------------
 
-    def _transition(self, kind: TransitionKind, **fields: Any) -> Transition:
-        return Transition(
-            task=self.record.id,
-            sequence=self.record.sequence + 1,
-            kind=kind,
-            at_ns=time.time_ns(),
-            coordinator=self._plane.gateway,
-            **fields,
-        )
-
-    def _apply(self, transition: Transition, *, durable: bool = True) -> None:
-        """Apply a transition in memory; `_flush` writes and publishes it before anything follows from it."""
-        before = {each.subtask.id for each in machine.ready(self.record)}
-        self.record = machine.apply(self.record, transition)
-        self._pending.append(transition)
-        self._dirty = self._dirty or durable
-        for each in machine.ready(self.record):
-            if each.subtask.id not in before:
-                self._ready_ns[each.subtask.id] = time.monotonic_ns()
-
-    async def _flush(self) -> None:
-        """Write the record, then publish what led to it and send the orders that follow.
-
-        Raises SupersededError when the record has moved on.
-
-        One write covers all transitions since the last: a finished subtask and the dispatch of its successors
-        become durable together, which takes a replicated write off the successors' start.
-        """
-        if self._dirty:
-            try:
-                # Every write survives the death of processes. Only an end is synced to disk: what a power cut of
-                # the whole site takes from the middle of a task is done again under the same effect ids.
-                self._version = await self._plane.dht.write(
-                    task_key(self.record.id),
-                    encode(self.record),
-                    expected=self._version,
-                    durable=self.record.state.final,
-                )
-            except ConflictError:
-                await self._reread()
-            self._dirty = False
-        if not self._pending:
-            return
+    def _written(self) -> None:
         outgoing, self._outgoing = self._outgoing, []
         for gateway, request in outgoing:
             self._sent_at[request.subtask] = time.monotonic()
             self._start(self._send(gateway, request))
-        for transition in self._pending:
-            self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
-        self._pending.clear()
-        self._plane.session.put(self._plane.keys.task(self.record.id), encode(self.record))
-        self._on_change(self.record)
 
     def _start(self, order: Coroutine[Any, Any, object]) -> None:
         task = asyncio.create_task(order)
         self._orders.add(task)
         task.add_done_callback(self._orders.discard)
-
-    async def _reread(self) -> None:
-        """The record has moved on: stop, and let the coordinator that owns the key read it anew."""
-        current = await self._plane.dht.read(task_key(self.record.id))
-        holder = ""
-        if current is not None:
-            holder = read_record(current.value).coordinator
-        raise SupersededError(f"the record has moved on to {holder or 'nobody'}")
 
 
 def _with_failure(target: SubtaskRecord, failure: Failure) -> SubtaskRecord:

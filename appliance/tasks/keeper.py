@@ -1,0 +1,105 @@
+"""Keeps a task's record for its driver: applies transitions in memory, writes them as one, then publishes them.
+
+It is the half of driving that makes two coordinators safe: nothing follows from a transition before the record
+with it is written under compare-and-set, and a record that has moved on ends the driver.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from appliance.errors import ConflictError, SwiftbotError
+from appliance.model import TaskRecord, VersionVector, encode
+from appliance.plane.node import Plane
+from appliance.tasks import machine
+from appliance.tasks.bounds import read_record
+from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.surroundings import task_key
+
+
+class SupersededError(SwiftbotError):
+    """Another gateway coordinates the task now."""
+
+    code = "superseded"
+
+
+class Keeper:
+    """A record, its version, and the transitions that are not written yet."""
+
+    def __init__(
+        self, plane: Plane, record: TaskRecord, version: VersionVector, on_change: Callable[[TaskRecord], None]
+    ) -> None:
+        self._plane = plane
+        self.record = record
+        self._version = version
+        self._on_change = on_change
+        self._pending: list[Transition] = []
+        self._dirty = False
+        self._ready_ns: dict[str, int] = {}
+        """When each subtask became ready, on this machine's clock."""
+
+    def _written(self) -> None:
+        """The record is written: what follows from it may begin."""
+
+    def _transition(self, kind: TransitionKind, **fields: Any) -> Transition:
+        return Transition(
+            task=self.record.id,
+            sequence=self.record.sequence + 1,
+            kind=kind,
+            at_ns=time.time_ns(),
+            coordinator=self._plane.gateway,
+            **fields,
+        )
+
+    def _apply(self, transition: Transition, *, durable: bool = True) -> None:
+        """Apply a transition in memory; `_flush` writes and publishes it before anything follows from it."""
+        before = {each.subtask.id for each in machine.ready(self.record)}
+        self.record = machine.apply(self.record, transition)
+        self._pending.append(transition)
+        self._dirty = self._dirty or durable
+        for each in machine.ready(self.record):
+            if each.subtask.id not in before:
+                self._ready_ns[each.subtask.id] = time.monotonic_ns()
+
+    async def _flush(self) -> None:
+        """Write the record, then publish what led to it and send the orders that follow.
+
+        Raises SupersededError when the record has moved on.
+
+        One write covers all transitions since the last: a finished subtask and the dispatch of its successors
+        become durable together, which takes a replicated write off the successors' start.
+        """
+        if self._dirty:
+            try:
+                # Every write survives the death of processes. Only an end is synced to disk: what a power cut of
+                # the whole site takes from the middle of a task is done again under the same effect ids.
+                self._version = await self._plane.dht.write(
+                    task_key(self.record.id),
+                    encode(self.record),
+                    expected=self._version,
+                    durable=self.record.state.final,
+                )
+            except ConflictError:
+                await self._reread()
+            self._dirty = False
+        if not self._pending:
+            return
+        self._written()
+        for transition in self._pending:
+            self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
+        self._pending.clear()
+        self._plane.session.put(self._plane.keys.task(self.record.id), encode(self.record))
+        self._on_change(self.record)
+
+    def _take(self, transition: Transition, *, durable: bool = True) -> bool:
+        if fits := machine.fits(self.record, transition):
+            self._apply(transition, durable=durable)
+        return fits
+
+    async def _reread(self) -> None:
+        """The record has moved on: stop, and let the coordinator that owns the key read it anew."""
+        current = await self._plane.dht.read(task_key(self.record.id))
+        holder = ""
+        if current is not None:
+            holder = read_record(current.value).coordinator
+        raise SupersededError(f"the record has moved on to {holder or 'nobody'}")
