@@ -100,6 +100,10 @@ def read_state(directory: Path) -> FleetState:
         return msgspec.json.decode(path.read_bytes(), type=FleetState)
     except FileNotFoundError:
         raise NotFoundError(f"no fleet runs in {directory}", remedy="start one with `swiftbot up`") from None
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}", remedy="give a --dir that is a readable folder"
+        ) from error
     except msgspec.DecodeError as error:
         raise ConfigError(f"{path} cannot be read: {error}", remedy="remove it and start the fleet anew") from error
 

@@ -98,7 +98,7 @@ class Executor:
         """
         check_name(request.task, "task")
         check_name(request.subtask, "subtask")
-        if request.attempt < 1 or not 0 < request.deadline_s <= MAX_RUN_S + 3600:
+        if request.attempt < 1 or not 0 < request.deadline_s <= 2 * MAX_RUN_S:
             raise PayloadError(f"attempt {request.attempt} within {request.deadline_s:g} s cannot be run")
         run_id = request.run_id
         if run_id in self._accepted:
