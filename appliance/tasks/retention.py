@@ -7,13 +7,12 @@ is still in the logs.
 import asyncio
 import contextlib
 
-import msgspec
 import structlog
 
-from appliance.errors import ConflictError, SwiftbotError
-from appliance.model import TaskRecord
+from appliance.errors import ConflictError, PayloadError, SwiftbotError
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
+from appliance.tasks.bounds import read_record
 from appliance.tasks.settings import TasksConfig
 
 log = structlog.get_logger(__name__)
@@ -41,7 +40,7 @@ class Retention:
             await asyncio.sleep(self._config.retention_s)
             try:
                 removed = await self.round()
-            except SwiftbotError as error:
+            except (SwiftbotError, OSError) as error:
                 log.warning("forgetting is tried again later", reason=str(error))
                 continue
             if removed:
@@ -62,8 +61,8 @@ class Retention:
         owned = await self._owned("task/")
         finished: list[tuple[int, str]] = []
         for key, stored in owned.items():
-            with contextlib.suppress(msgspec.DecodeError):
-                record = msgspec.json.decode(stored.value, type=TaskRecord)
+            with contextlib.suppress(PayloadError):
+                record = read_record(stored.value)
                 if record.state.final:
                     finished.append((record.updated_ns, key))
         return [owned[key] for key in surplus(finished, self._config.keep_finished)]
