@@ -40,6 +40,8 @@ _SOON_S = 0.1
 """The same while requests wait for the comparison."""
 _TRIES = 3
 """Comparisons with a new ring before this gateway goes on without a member that is seen but does not answer."""
+_LOST_S = 600.0
+"""How long a member that was lost is asked whether it is there after all."""
 _BREATH = 500
 """Keys looked at before the loop gets a turn."""
 
@@ -106,6 +108,8 @@ class Reconciler:
         rpc.register("dht_fetch", FetchAsk, self._on_fetch, exchange=False)
         membership.on_joined.append(self._on_member)
         membership.on_lost.append(self._on_member)
+        self._lost: dict[str, float] = {}
+        membership.on_lost.append(self._note_lost)
         pulse.on_stalled.append(self._changed.set)
 
     def start(self) -> None:
@@ -150,9 +154,28 @@ class Reconciler:
                 settled, tries = now, 0
                 await self._dht.settled(ring, stalls)
                 self._tell(self._dht.on_ring_change)
-            elif fetched:
+                continue
+            if fetched:
                 # A member that could not be asked when the ring changed was heard only now: same news.
                 self._tell(self._dht.on_ring_change)
+            await self._ask_lost()
+
+    def _note_lost(self, name: str) -> None:
+        self._lost[name] = time.monotonic() + _LOST_S
+
+    async def _ask_lost(self) -> None:
+        """Two gateways that lost each other's tokens though they are linked would otherwise never ask each other."""
+        now, members = time.monotonic(), self._membership.members
+        self._lost = {name: until for name, until in self._lost.items() if until > now and name not in members}
+
+        async def ask(name: str) -> None:
+            with contextlib.suppress(SwiftbotError):  # nobody answers: it is gone indeed
+                asked = DigestAsk(asker=self._gateway)
+                answer = await self._rpc.call(name, "dht_digest", asked, DigestList, timeout_s=_ASK_S + _SEE_S)
+                if answer.unseen:
+                    self._membership.show_again()
+
+        await asyncio.gather(*(ask(name) for name in self._lost))
 
     def _tell(self, callbacks: list[Callable[[], None]]) -> None:
         for callback in tuple(callbacks):

@@ -425,6 +425,18 @@ async def test_a_token_that_got_lost_is_shown_again(fleet: Fleet) -> None:
     assert fleet.planes[0].members() == third.members() == {"g0", "g2"}
 
 
+async def test_gateways_that_lost_each_others_tokens_meet_again(fleet: Fleet) -> None:
+    """Two gateways that both lost the other's token though they are linked find each other at the next comparison."""
+    first, third = fleet.planes[1], fleet.planes[2]
+    third._membership._seen(first.keys.alive("g1"), alive=False)
+    first._membership._seen(first.keys.alive("g2"), alive=False)
+    await _until(lambda: first.dht.reconciled() and third.dht.reconciled())
+    assert first.members() == {"g0", "g1"}
+    first._reconciler._changed.set()
+    await fleet.settled()
+    assert third.members() == first.members() == {"g0", "g1", "g2"}
+
+
 async def test_a_gateway_that_stood_still_orders_nothing_until_it_knows(fleet: Fleet) -> None:
     """An owner that stood still refuses writes sent before, has missed ones before it answers, then owns as before."""
     plane = fleet.planes[2]
