@@ -272,8 +272,6 @@ def log_summary(found: LogInfo) -> Group:
         style="bold",
     )
     notes = [Text(f"! {problem}", style="yellow") for problem in found.problems]
-    if found.recovered:
-        notes.append(Text("! the file was not finished; all whole chunks of it were read", style="yellow"))
     if found.dropped:
         notes.append(Text(f"! the recorder could not write {found.dropped:,} messages", style="yellow"))
     return Group(head, *notes, table)
