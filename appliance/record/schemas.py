@@ -129,6 +129,12 @@ MAVLINK_KIND = ChannelKind("", b"", "mavlink")
 PLAIN_JSON = ChannelKind("", b"", "json")
 
 
+def _outline(name: str, **properties: str) -> ChannelKind:
+    """A kind whose struct belongs to a room above: the fields that are always there, and whatever else comes."""
+    schema = {"title": name, "type": "object", "properties": {key: {"type": kind} for key, kind in properties.items()}}
+    return ChannelKind(f"swiftbot.{name}", msgspec.json.encode(schema), "json")
+
+
 class KeySchemas:
     """The kinds of one fleet's keys. `kind_of` is asked once per key and encoding, not once per message."""
 
@@ -139,6 +145,22 @@ class KeySchemas:
             (keys.container(), struct_kind(ContainerInfo)),
             (keys.log(), struct_kind(LogLine)),
             (keys.task(), struct_kind(TaskRecord)),
+            (
+                keys.transition(),
+                _outline(
+                    "Transition",
+                    task="string",
+                    sequence="integer",
+                    kind="string",
+                    at_ns="integer",
+                    coordinator="string",
+                    subtask="string",
+                    attempt="integer",
+                    gateway="string",
+                    note="string",
+                ),
+            ),
+            (keys.exchange(), _outline("Exchange", verb="string", gateway="string", duration_ms="number")),
             (keys.run(), struct_kind(RunEvent)),
             (keys.robot(), struct_kind(RobotInfo)),
             (keys.commanded(), struct_kind(RobotCommand)),

@@ -29,8 +29,8 @@ SCHEMAS = KeySchemas(KEYS)
         (KEYS.intake("r1"), "swiftbot.TaskRequest", "json"),
         (KEYS.notice("ops"), "swiftbot.Notice", "json"),
         (KEYS.recorder_status("rec"), "swiftbot.RecorderStatus", "json"),
-        (KEYS.transition("t1"), "", "json"),
-        (KEYS.exchange("g1", "submit"), "", "json"),
+        (KEYS.transition("t1"), "swiftbot.Transition", "json"),
+        (KEYS.exchange("g1", "submit"), "swiftbot.Exchange", "json"),
     ],
 )
 def test_each_key_has_its_kind(key: str, schema: str, encoding: str) -> None:
