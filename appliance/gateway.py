@@ -38,6 +38,8 @@ from appliance.tasks.retention import Retention
 log = structlog.get_logger(__name__)
 
 VERSION = "0.1.0"
+SETTLE_S = 3.0
+"""How long a draining gateway waits for the ends of its runs to be written: a replicated write takes milliseconds."""
 MOST_HANDED_IN = 64
 """Tasks of robots on their way at once; a robot that asks faster is refused, and counted."""
 
@@ -171,6 +173,7 @@ class Gateway:
         log.info("gateway drains", runs=self.executor.running, deadline_s=self.config.drain_s)
         try:
             await self.executor.drain(self.config.drain_s)
+            await self.manager.settle(SETTLE_S)
         finally:
             await self._stack.aclose()
 

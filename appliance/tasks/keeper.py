@@ -38,6 +38,12 @@ class Keeper:
         self._ready_ns: dict[str, int] = {}
         """When each subtask became ready, on this machine's clock."""
 
+    @property
+    def settled(self) -> bool:
+        """Whether all that is known is written, and nothing is awaited of this gateway's own runs."""
+        here = any(each.gateway == self._plane.gateway for each in machine.active(self.record))
+        return not here and not self._pending and not self._dirty
+
     def _written(self) -> None:
         """The record is written: what follows from it may begin."""
 

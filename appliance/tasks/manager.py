@@ -122,6 +122,15 @@ class TaskManager:
         self._sweeper = asyncio.create_task(self._keep_sweeping(), name="task takeover")
         self._sweep.set()
 
+    async def settle(self, deadline_s: float) -> None:
+        """Wait until the ends of this gateway's own runs, which is draining, stand in the records driven here.
+
+        Otherwise the next coordinator would find them running on a gateway that is gone, and repeat them.
+        """
+        until = time.monotonic() + deadline_s
+        while time.monotonic() < until and not all(driver.settled for driver in self._drivers.values()):  # noqa: ASYNC110 - several drivers, a few seconds at most
+            await asyncio.sleep(0.02)
+
     async def stop(self) -> None:
         """Stop driving; the records stay, and the next owner of each key goes on."""
         self._stopping = True
