@@ -104,6 +104,48 @@ class Failure(Struct, frozen=True, kw_only=True, omit_defaults=True):
     retryable: bool = False
 
 
+class Way(StrEnum):
+    """How a container comes to serve a subtask; the cheaper of the last two is taken (algorithms: selection)."""
+
+    HERE = "here"
+    """It is on the gateway that decides, with the state the subtask asks for."""
+    RUN_THERE = "run there"
+    """The subtask goes to the container: input bytes / bandwidth + round trip."""
+    BRING_HERE = "bring here"
+    """State volumes come to a container here: state bytes / bandwidth + serialise + deserialise + start."""
+    NEW = "new"
+    """A cold start."""
+
+
+class Considered(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One possibility that a selection weighed. `verdict` says in words why it was (not) taken."""
+
+    gateway: str
+    container: str = ""
+    image: str = ""
+    way: Way = Way.HERE
+    score: float = 0.0
+    cost_ms: float = 0.0
+    taken: bool = False
+    verdict: str = ""
+
+
+class Choice(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How a container was selected for an attempt, kept in the task's record for `swiftbot pool why`."""
+
+    phase: Phase
+    way: Way
+    by: str
+    """The gateway that decided."""
+    gateway: str
+    container: str = ""
+    cold_ms: float = 0.0
+    """What a cold start was expected to cost there and then."""
+    considered: tuple[Considered, ...] = ()
+    """The best ones first, at most 12."""
+    why: str = ""
+
+
 class Attempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One try at a subtask; `number` fences off late results of earlier tries."""
 
@@ -112,6 +154,10 @@ class Attempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
     container: str = ""
     phase: Phase | None = None
     failure: Failure | None = None
+    placed: str = ""
+    """Why this gateway: the coarse scores, in words."""
+    choice: Choice | None = None
+    """Why this container: what the gateway's selection weighed."""
 
 
 class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -200,6 +246,8 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     deadline_s: float = 120.0
     hops: int = 0
     """How often it was passed on to a gateway with a warm container; one is the most."""
+    resume: dict[str, Any] | None = None
+    """The last checkpoint of an earlier attempt, from which the handler may go on."""
 
     @property
     def run_id(self) -> str:
@@ -208,21 +256,24 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class RunAccepted(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Answer to a run order: where it runs. `why` is the selection's explanation."""
+    """Answer to a run order: where it runs, and how that was decided."""
 
     gateway: str
     container: str
     phase: Phase
     why: str = ""
+    choice: Choice | None = None
 
 
 class RunEventKind(StrEnum):
-    """What a run tells: `started`, any number of `progress`/`log`/`partial`, then `succeeded` or `failed`."""
+    """What a run tells: `started`, any number of the next four, then `succeeded` or `failed`."""
 
     STARTED = "started"
     PROGRESS = "progress"
     LOG = "log"
     PARTIAL = "partial"
+    CHECKPOINT = "checkpoint"
+    """`result` is data from which a later attempt can go on."""
     SUCCEEDED = "succeeded"
     FAILED = "failed"
 
@@ -280,6 +331,29 @@ class ContainerInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
     since_ns: int = 0
 
 
+class VolumeInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A named state volume as the gateway that holds its newest state tells it. It outlives its containers."""
+
+    name: str
+    gateway: str
+    generation: int = 0
+    """Grows with each run that changed it; the highest is the newest."""
+    size_bytes: int = 0
+
+
+class PoolHint(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a plan will need of a pool: so many containers of an image, in about so long (algorithms: prewarming)."""
+
+    image: str
+    count: int = 1
+    in_s: float = 0.0
+    """From now until it is needed, on the receiver's clock."""
+    keep_s: float = 60.0
+    """How long beyond that it is worth keeping."""
+    task: str = ""
+    need: Need | None = None
+
+
 class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A gateway's own account of itself, pushed on change and every few seconds."""
 
@@ -305,6 +379,10 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """False where the kernel's cgroups do not let rootless containers be limited."""
     pool_problem: str = ""
     """Why the pool cannot start containers now; empty when it can."""
+    images: tuple[str, ...] = ()
+    """References of the images it has and can give to others."""
+    volumes: tuple[VolumeInfo, ...] = ()
+    """State volumes whose newest state is there."""
     robots: tuple[str, ...] = ()
     endpoints: tuple[str, ...] = ()
     refused: dict[str, int] = field(default_factory=dict[str, int])

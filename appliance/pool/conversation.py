@@ -50,6 +50,7 @@ def order(request: RunRequest, site: dict[str, Any]) -> Frame:
         "params": request.params,
         "inputs": request.inputs,
         "attempt": request.attempt,
+        "resume": request.resume,
         "site": site,
         "timeout_s": request.deadline_s,
         "memory_mb": request.need.memory_mb,
@@ -144,7 +145,7 @@ class Conversation:
                 self._on_event(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
                 data = _table(frame.get("data"))
-                self._on_event(self.event(RunEventKind.PARTIAL, result=data, note="checkpoint"))
+                self._on_event(self.event(RunEventKind.CHECKPOINT, result=data))
             case "call":
                 await self._call(frame)
             case "result":

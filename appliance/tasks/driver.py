@@ -94,7 +94,7 @@ class Driver(Keeper):
 
     def _useful(self, event: RunEvent) -> bool:
         """Whether an event is of a current attempt and tells something that the record keeps."""
-        if event.kind in (RunEventKind.LOG, RunEventKind.PARTIAL):
+        if event.kind in (RunEventKind.LOG, RunEventKind.PARTIAL, RunEventKind.CHECKPOINT):
             return False
         current = next((each for each in self.record.subtasks if each.subtask.id == event.subtask), None)
         return current is not None and event.attempt == current.attempt and not current.state.final
@@ -347,7 +347,7 @@ class Driver(Keeper):
             case RunEventKind.FAILED:
                 failure = event.failure or Failure(code="internal", message="the run failed without a reason")
                 self._attempt_failed(target, failure, event.duration_ms)
-            case RunEventKind.LOG | RunEventKind.PARTIAL:
+            case RunEventKind.LOG | RunEventKind.PARTIAL | RunEventKind.CHECKPOINT:
                 pass
 
     def _attempt_failed(self, target: SubtaskRecord, failure: Failure, duration_ms: float | None) -> None:
