@@ -1,0 +1,41 @@
+"""`swiftbot …`: parses arguments and prints; the work is done in the rooms.
+
+Exit codes: 0 done; 1 it failed (a task that did not succeed, an internal error); 2 the command line or a
+configuration is wrong; 3 nobody answered; 4 refused or not found; 5 something the machine must have is missing;
+6 too late; 7 cancelled; 130 interrupted.
+"""
+
+import sys
+
+from cyclopts import App, CycloptsError
+from rich.markup import escape
+
+from appliance import console, logs
+from appliance.cli import bench, daemons, fleet, pool, tools, work
+from appliance.errors import SwiftbotError
+
+app = App(
+    name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
+)
+for part in (fleet, work, daemons, pool, tools, bench):
+    part.add_to(app)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: run a command and end with its exit code."""
+    # Commands speak for themselves; daemons set up their own logging when they start.
+    logs.configure(level="warning", style="text")
+    try:
+        code = app(arguments, exit_on_error=False, print_error=True, result_action="return_value")
+        code = code if isinstance(code, int) else 0
+    except CycloptsError:
+        code = 2
+    except SwiftbotError as error:
+        # Messages hold what people and robots wrote: brackets in them are no markup.
+        console.err.print(f"[red]error:[/red] {escape(error.message)}", markup=True)
+        if error.remedy:
+            console.err.print(f"  remedy: {error.remedy}", markup=False)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        code = 130
+    sys.exit(code)

@@ -1,0 +1,133 @@
+"""What runs until it is told to stop: `swiftbot gateway`, `record`, `sim …`."""
+
+import asyncio
+import signal
+from pathlib import Path
+
+import msgspec
+import uvloop
+from cyclopts import App
+
+from appliance import logs, service
+from appliance.cli.common import DAEMONS, HERE, Where
+
+sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
+
+
+def add_to(app: App) -> None:
+    """Add these commands."""
+    for command in (gateway, record):
+        app.command(command, group=DAEMONS)
+    app.command(sim_app)
+
+
+def gateway(*, config: Path) -> int:
+    """Run a gateway until SIGTERM, which drains it.
+
+    Args:
+        config: TOML file, see docs/configuration.md.
+    """
+    from appliance import config as configuration
+    from appliance import gateway as daemon
+
+    loaded = configuration.load(config)
+    logs.configure(level=loaded.log_level, style=loaded.log_format)
+    uvloop.run(daemon.run(loaded))
+    return 0
+
+
+def record(*, config: Path | None = None, out: Path | None = None, where: Where = HERE) -> int:
+    """Record every message of a fleet into MCAP until SIGTERM or Ctrl-C.
+
+    Args:
+        config: A gateway's TOML file: its fleet, endpoints and [record] section.
+        out: Directory for the log files, instead of the configured one.
+        where: The fleet, when no configuration is given.
+    """
+    from appliance import config as configuration
+    from appliance.plane.settings import PlaneConfig
+    from appliance.record.recorder import run_recorder
+    from appliance.record.settings import RecordConfig
+
+    if config is not None:
+        loaded = configuration.load(config)
+        logs.configure(level=loaded.log_level, style=loaded.log_format)
+        fleet, settings = loaded.fleet, loaded.record
+        connect = (*loaded.plane.listen, *loaded.plane.connect)
+    else:
+        endpoint = where.endpoint()
+        fleet, connect, settings = endpoint.fleet, endpoint.connect, RecordConfig(directory=str(Path.cwd()))
+        logs.configure(style="text")
+    if out is not None:
+        settings = msgspec.structs.replace(settings, directory=str(out))
+
+    async def go() -> None:
+        # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
+        plane = PlaneConfig(mode="peer", connect=connect)
+        await run_recorder(settings, plane, fleet, _until_signalled(), alive=_tell_systemd)
+
+    uvloop.run(go())
+    return 0
+
+
+def _tell_systemd(_: object) -> None:
+    service.ready()
+    service.alive()
+
+
+def _until_signalled() -> asyncio.Event:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    return stop
+
+
+@sim_app.command
+def mavlink(*, to: str, system: int = 1, site: str = "warehouse", rate: float = 1.0, start: str = "home") -> int:
+    """Simulate a MAVLink copter that sends to a gateway's UDP port.
+
+    Args:
+        to: Where the gateway listens, udp://host:port.
+        system: MAVLink system id, 1 to 255.
+        site: Built-in site or site file.
+        rate: How many times faster than real it moves.
+        start: Place it starts at.
+    """
+    from appliance.robots.sim.mavlink import VehicleSettings, run_vehicle
+    from appliance.skills.sites import load_site
+
+    logs.configure(style="text")
+    settings = VehicleSettings(to=to, system=system, site=load_site(site), rate=rate, start=start)
+
+    async def go() -> None:
+        await run_vehicle(settings, stop=_until_signalled())
+
+    asyncio.run(go())
+    return 0
+
+
+@sim_app.command
+def zenoh(*, name: str, site: str = "warehouse", rate: float = 1.0, start: str = "charger", where: Where = HERE) -> int:
+    """Simulate a mobile robot with arm and camera that speaks Zenoh.
+
+    Args:
+        name: Its name in the roster.
+        site: Built-in site or site file.
+        rate: How many times faster than real it moves.
+        start: Place it starts at.
+        where: The fleet.
+    """
+    from appliance.robots.sim.zenoh_robot import RobotSettings, run_robot
+    from appliance.skills.sites import load_site
+
+    logs.configure(style="text")
+    endpoint = where.endpoint()
+    settings = RobotSettings(
+        name=name, fleet=endpoint.fleet, connect=endpoint.connect, site=load_site(site), rate=rate, start=start
+    )
+
+    async def go() -> None:
+        await run_robot(settings, stop=_until_signalled())
+
+    asyncio.run(go())
+    return 0

@@ -1,0 +1,178 @@
+"""Work with a fleet: `swiftbot submit`, `plan`, `task …`, `fleet`, `robots`, `tui`."""
+
+import asyncio
+import os
+import uuid
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from appliance import console
+from appliance.cli.common import HERE, WORK, Json, Where, show
+from appliance.client import FleetClient
+from appliance.errors import NotFoundError, SwiftbotError
+from appliance.model import TaskRecord, TaskRequest, TaskState
+from appliance.tasks.view import view
+
+task_app = App(name="task", help="List, show and cancel tasks.", group=WORK)
+
+
+def add_to(app: App) -> None:
+    """Add these commands."""
+    for command in (plan, submit, fleet, robots, tui):
+        app.command(command, group=WORK)
+    app.command(task_app)
+
+
+def plan(text: str, *, as_json: Json = False, where: Where = HERE) -> int:
+    """Decompose an instruction and print the plan; nothing is run."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            answer = await client.plan(text)
+        show(answer, as_json=as_json, table=console.plan_graph(answer.plan))
+
+    asyncio.run(go())
+    return 0
+
+
+def submit(
+    text: str,
+    *,
+    wait: Annotated[
+        bool, Parameter(negative="", help="Show progress and wait for the end; Ctrl-C cancels it.")
+    ] = False,
+    task_id: Annotated[str, Parameter(name="--id", help="Task id; a known one is not done twice.")] = "",
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Hand in an instruction; without --wait it returns when the task is planned."""
+    from appliance.demo import follow
+
+    # The id is chosen here: an interrupt while the task is being handed in must know what to cancel.
+    request = TaskRequest(instruction=text, id=task_id or f"t-{uuid.uuid4().hex[:10]}", submitter=_me())
+
+    async def go() -> TaskRecord:
+        async with FleetClient(where.endpoint()) as client:
+            try:
+                accepted = await client.submit(request)
+                console.err.print(f"task {accepted.id} is accepted")
+                if not wait:
+                    return await client.planned(accepted.id)
+                if not as_json:
+                    return await follow(client, accepted.id)
+                last = accepted
+                async for record in client.watch(accepted.id):
+                    last = record
+            except asyncio.CancelledError:
+                if wait:
+                    await _cancel(client, request.id)
+                raise
+            return last
+
+    record = asyncio.run(go())
+    if as_json or not wait:
+        show(view(record), as_json=as_json, table=console.task_table(record))
+    return _outcome(record)
+
+
+async def _cancel(client: FleetClient, task: str) -> None:
+    """Cancel a task after an interrupt; that it cannot be done is said, and the command still ends as interrupted."""
+    console.err.print(f"cancelling task {task}")
+    try:
+        await client.cancel(task)
+    except NotFoundError:
+        console.err.print(f"task {task} had not been accepted")
+    except SwiftbotError as error:
+        console.err.print(f"task {task} may go on: {error}", markup=False)
+
+
+def _outcome(record: TaskRecord) -> int:
+    if record.state is TaskState.FAILED:
+        return 4 if record.failure is not None and record.failure.code == "plan" else 1
+    return 7 if record.state is TaskState.CANCELLED else 0
+
+
+def _me() -> str:
+    return os.environ.get("USER") or f"uid {os.getuid()}"
+
+
+@task_app.command(name="list")
+def task_list(*, limit: int = 20, as_json: Json = False, where: Where = HERE) -> int:
+    """List the newest tasks of the fleet."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            found = await client.tasks(limit)
+        for each in found.unreachable:
+            console.err.print(f"{each} did not answer; its tasks may be missing")
+        show([view(each) for each in found.tasks], as_json=as_json, table=console.task_list(found.tasks))
+
+    asyncio.run(go())
+    return 0
+
+
+@task_app.command(name="show")
+def task_show(task: str, *, as_json: Json = False, where: Where = HERE) -> int:
+    """Show a task with its subtasks."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            record = await client.task(task)
+        show(view(record), as_json=as_json, table=console.task_table(record))
+
+    asyncio.run(go())
+    return 0
+
+
+@task_app.command(name="cancel")
+def task_cancel(task: str, *, as_json: Json = False, where: Where = HERE) -> int:
+    """Stop a task; returns when it has ended."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            record = await client.cancel(task)
+            if not record.state.final:
+                console.err.print(f"task {task} is being cancelled")
+            async for record in client.watch(task):  # noqa: B007 - the last one is shown
+                pass
+        show(view(record), as_json=as_json, table=console.task_table(record))
+
+    asyncio.run(go())
+    return 0
+
+
+def fleet(*, as_json: Json = False, where: Where = HERE) -> int:
+    """Show the gateways."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            await client.gateway()
+            found = sorted(client.plane.registry.gateways.values(), key=lambda each: each.id)
+        show(found, as_json=as_json, table=console.gateway_table(found))
+
+    asyncio.run(go())
+    return 0
+
+
+def robots(*, as_json: Json = False, where: Where = HERE) -> int:
+    """Show the robots."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            await client.gateway()
+            found = sorted(client.plane.registry.robots.values(), key=lambda each: each.id)
+        show(found, as_json=as_json, table=console.robot_table(found))
+
+    asyncio.run(go())
+    return 0
+
+
+def tui(*, where: Where = HERE) -> int:
+    """Open the terminal UI on a fleet."""
+    from appliance.plane.settings import PlaneConfig
+    from appliance.tui.app import run_tui
+
+    endpoint = where.endpoint()
+    asyncio.run(run_tui(PlaneConfig(mode="client", connect=endpoint.connect), endpoint.fleet))
+    return 0
