@@ -21,8 +21,19 @@ from appliance import logs, service
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, SwiftbotError
 from appliance.llm.cascade import Decomposer
-from appliance.model import ContainerInfo, ContainerState, GatewayStatus, LogLine, Need, RunRequest, Site, TaskRequest
+from appliance.model import (
+    ContainerInfo,
+    ContainerState,
+    GatewayStatus,
+    LogLine,
+    Need,
+    PoolHint,
+    RunRequest,
+    Site,
+    TaskRequest,
+)
 from appliance.plane.node import Plane
+from appliance.pool.api import EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.pool import Call, Pool
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
@@ -123,6 +134,10 @@ class Gateway:
         rpc.register("run_cancel", RunAsk, self.executor.cancel)
         rpc.register("artifact", ArtifactAsk, artifacts.piece)
         rpc.register("find_containers", Need, remote.answer)
+        rpc.register("pool_hint", PoolHint, self.pool.hint)
+        rpc.register("pool_warm", WarmAsk, self.pool.warm)
+        rpc.register("pool_evict", EvictAsk, self.pool.evict)
+        rpc.register("pool_release_quarantine", ReleaseAsk, self.pool.release_quarantine)
 
         self.manager = TaskManager(
             config.tasks,
@@ -236,6 +251,7 @@ class Gateway:
             containers=len(containers),
             ready=sum(each.state is ContainerState.READY for each in containers),
             running=self.executor.running,
+            queue=self.pool.queue,
             tasks=self.manager.unfinished,
             draining=self._draining,
             limits_enforced=self.pool.limits_enforced,

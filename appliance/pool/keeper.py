@@ -71,6 +71,8 @@ class Keeper:
         self._waiting: deque[_Waiter] = deque()
         self._background: set[asyncio.Task[None]] = set()
         self._quarantine = policies.Quarantine(after=config.bad_starts, for_s=config.quarantine_s)
+        self._asked: dict[str, tuple[int, float]] = {}
+        """Containers of each image that somebody asked to have ready, and until when."""
         self._clock = 0.0
         self._engine: Engine | None = None
         self._connecting: asyncio.Task[None] | None = None
@@ -79,6 +81,7 @@ class Keeper:
         self._adopted = False
         self._stopped = False
         self._wake = asyncio.Event()
+        self._watchers: set[asyncio.Event] = set()
         self._tender: asyncio.Task[None] | None = None
 
     # --- what is --------------------------------------------------------------------------------------------
@@ -116,6 +119,69 @@ class Keeper:
                 f"all {len(self._pooled)} containers of {self._gateway} are busy and {len(self._waiting)} runs wait",
                 remedy="wait, or raise pool.capacity",
             )
+
+    # --- what others ask --------------------------------------------------------------------------------------
+
+    def want(self, image: str, count: int, for_s: float) -> None:
+        """Have so many containers of an image ready for so long, as far as there is room."""
+        now = time.monotonic()
+        before, until = self._asked.get(image, (0, 0.0))
+        if until > now:
+            count, for_s = max(before, count), max(until - now, for_s)
+        self._asked[image] = (count, now + for_s)
+        self._wake.set()
+
+    def why_no_start(self, image: str) -> str:
+        """Return why one more container of an image cannot be started now; empty when it can."""
+        if self.podman_problem:
+            return self.podman_problem
+        reason = self._quarantine.reason(image, time.monotonic())
+        if reason:
+            return reason
+        size_mb = self._starter.size(image).memory_mb
+        if self._free(size_mb, spare_floor=True, commit=False) is not None:
+            return ""
+        held_mb = sum(each.info.memory_mb for each in self._pooled.values())
+        holders = Counter(f"{each.info.state} {each.info.image}" for each in self._pooled.values())
+        return (
+            f"no room for one more {image} container ({size_mb} MB): {len(self._pooled)} of {self._config.capacity}"
+            f" places and {held_mb} of {self._config.memory_mb} MB are taken by "
+            + ", ".join(f"{count} {what}" for what, count in sorted(holders.items()))
+        )
+
+    async def have(self, image: str, count: int) -> None:
+        """Wait until so many containers of an image are ready, or no more can be started."""
+        changed = asyncio.Event()
+        self._watchers.add(changed)
+        try:
+            while self._count(image, ContainerState.READY) < count and (self._starts or not self.why_no_start(image)):
+                await changed.wait()
+                changed.clear()
+        finally:
+            self._watchers.discard(changed)
+
+    def why_kept(self, info: ContainerInfo) -> str:
+        """Return why a container cannot be given up now; empty when it can."""
+        match info.state:
+            case ContainerState.READY:
+                return ""
+            case ContainerState.BUSY:
+                return f"it runs {info.run}"
+            case ContainerState.RESERVED:
+                return "a run is about to begin in it"
+            case state:
+                return f"it is {state}"
+
+    def give_up(self, container_id: str, why: str) -> None:
+        """Retire a container that is idle."""
+        self.retire(self._pooled[container_id], why)
+
+    def release_quarantine(self, image: str) -> str:
+        """Start containers of an image again; returns why they were not, empty when they were."""
+        reason = self._quarantine.reason(image, time.monotonic())
+        self._quarantine.succeeded(image)
+        self._wake.set()
+        return reason
 
     # --- life -----------------------------------------------------------------------------------------------
 
@@ -285,7 +351,7 @@ class Keeper:
             idle,
             slots=len(self._pooled) + 1 - self._config.capacity,
             memory_mb=held + memory_mb - self._config.memory_mb,
-            floor=self._config.floor,
+            floor=self._wanted(time.monotonic()),
             spare_floor=spare_floor,
         )
         if commit:
@@ -395,6 +461,8 @@ class Keeper:
 
     def _changed(self) -> None:
         self._wake.set()
+        for watcher in self._watchers:
+            watcher.set()
         self._on_change(self.containers())
 
     # --- tending ----------------------------------------------------------------------------------------------
@@ -427,20 +495,29 @@ class Keeper:
         elif (
             info.state is ContainerState.READY
             and now - container.idle_since > self._config.idle_s
-            and self._count(info.image) > self._config.floor.get(info.image, 0)
+            and self._count(info.image) > self._wanted(now).get(info.image, 0)
         ):
             self.retire(container, "idle for long")
         elif info.state is not ContainerState.STARTING and now >= container.next_probe:
             container.next_probe = now + self._config.probe_s
             self.spawn(self._probe(container), f"probe {container.id}")
 
-    def _count(self, image: str) -> int:
-        coming = (ContainerState.READY, ContainerState.STARTING)
-        return sum(each.info.image == image and each.info.state in coming for each in self._pooled.values())
+    def _count(self, image: str, *states: ContainerState) -> int:
+        states = states or (ContainerState.READY, ContainerState.STARTING)
+        return sum(each.info.image == image and each.info.state in states for each in self._pooled.values())
+
+    def _wanted(self, now: float) -> dict[str, int]:
+        """Return how many containers of each image are to be ready: the floor, and what was asked for."""
+        self._asked = {image: each for image, each in self._asked.items() if each[1] > now}
+        wanted = dict(self._config.floor)
+        for image, (count, _) in self._asked.items():
+            wanted[image] = max(count, wanted.get(image, 0))
+        return wanted
 
     def _prewarm(self, now: float) -> None:
-        coming = {image: self._count(image) for image in self._config.floor}
-        for image in policies.wanted(self._config.floor, coming):
+        wanted = self._wanted(now)
+        coming = {image: self._count(image) for image in wanted}
+        for image in policies.wanted(wanted, coming):
             if len(self._starts) >= self._config.starts_at_once:
                 return
             if self._quarantine.reason(image, now):

@@ -26,12 +26,25 @@ from appliance.errors import (
     CancelledByOperatorError,
     ConfigError,
     NotFoundError,
+    PayloadError,
     PoolError,
     RefusedError,
     SwiftbotError,
     UnreachableError,
 )
-from appliance.model import ContainerInfo, Failure, Need, Phase, RunEvent, RunEventKind, RunRequest, Site
+from appliance.model import (
+    ContainerInfo,
+    ContainerState,
+    Failure,
+    Need,
+    Phase,
+    PoolHint,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
+    Site,
+)
+from appliance.pool.api import EvictAsk, Evicted, Hinted, ReleaseAsk, Released, WarmAsk, Warmed
 from appliance.pool.container import Connection, PooledContainer
 from appliance.pool.conversation import Call, Conversation, order
 from appliance.pool.engine import Engine, PodmanEngine
@@ -47,6 +60,10 @@ log = structlog.get_logger(__name__)
 
 BACKSTOP_S = 3.0
 """How much longer than the runner itself the pool waits for a run to end, before it ends the container."""
+MOST_AHEAD_S = 86400.0
+"""A day: nobody plans further ahead, and nothing is kept ready for longer on one word."""
+MOST_WAIT_S = 60.0
+"""An answer that is waited for longer is not wanted any more."""
 TRIES = 3
 """Containers that may be found dead at the moment a run is sent to them, before the run is given back."""
 
@@ -203,11 +220,7 @@ class Pool:
         return decision
 
     def _check(self, need: Need) -> None:
-        if need.image not in self._catalogue.images:
-            self.refused["unknown image"] += 1
-            raise NotFoundError(
-                f"no image {need.image[:60]!r}", remedy=f"known: {', '.join(sorted(self._catalogue.images))}"
-            )
+        self._check_image(need.image)
         if need.cpu <= 0 or need.memory_mb <= 0:
             self.refused["bad need"] += 1
             raise RefusedError("a need of no CPU or no memory", remedy="ask for more than 0 of each")
@@ -219,6 +232,118 @@ class Pool:
             )
         if self._draining:
             raise RefusedError(f"{self.gateway} is draining", remedy="another gateway takes it")
+
+    # --- what others and operators ask ------------------------------------------------------------------------
+
+    async def hint(self, hint: PoolHint) -> Hinted:
+        """Take note of what another gateway's plan will need here; best effort.
+
+        Raises:
+            NotFoundError: there is no such image.
+            PayloadError: numbers that cannot be.
+        """
+        self._check_image(hint.image)
+        if not (hint.count >= 1 and 0 <= hint.in_s <= MOST_AHEAD_S and 0 < hint.keep_s <= MOST_AHEAD_S):
+            self.refused["bad hint"] += 1
+            raise PayloadError(
+                f"{hint.count} containers in {hint.in_s:g} s for {hint.keep_s:g} s cannot be had ready",
+                remedy=f"at least one, within and for at most {MOST_AHEAD_S:g} s",
+            )
+        if why := self._no_warming():
+            return Hinted(taken=False, why=why)
+        self._keeper.want(hint.image, min(hint.count, self._config.capacity), hint.in_s + hint.keep_s)
+        return Hinted(taken=True)
+
+    async def warm(self, ask: WarmAsk) -> Warmed:
+        """Have containers of an image ready; answers at once, or when those that start are there.
+
+        Raises:
+            NotFoundError: there is no such image.
+            PayloadError: numbers that cannot be.
+            RefusedError: draining, mode cold, or none more can be started, with the reason.
+        """
+        self._check_image(ask.image)
+        if not (ask.count >= 1 and 0 < ask.keep_s <= MOST_AHEAD_S and 0 <= ask.wait_s <= MOST_WAIT_S):
+            self.refused["bad warm"] += 1
+            raise PayloadError(
+                f"{ask.count} containers for {ask.keep_s:g} s, answered within {ask.wait_s:g} s, cannot be had ready",
+                remedy=f"at least one, for at most {MOST_AHEAD_S:g} s, waiting at most {MOST_WAIT_S:g} s",
+            )
+        if why := self._no_warming():
+            raise RefusedError(why)
+        counted = self._count(ask.image)
+        if sum(counted) < ask.count and (why := self._keeper.why_no_start(ask.image)):
+            self.refused["no room to warm"] += 1
+            raise RefusedError(why, remedy="swiftbot pool evict something, raise pool.memory_mb, or wait")
+        self._keeper.want(ask.image, ask.count, ask.keep_s)
+        if ask.wait_s:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(ask.wait_s):
+                    await self._keeper.have(ask.image, ask.count)
+        ready, starting = self._count(ask.image)
+        problem = ""
+        if ready + starting < ask.count:
+            problem = self._keeper.why_no_start(ask.image) or "they are started as soon as others have been"
+        return Warmed(image=ask.image, ready=ready, starting=starting, problem=problem)
+
+    async def evict(self, ask: EvictAsk) -> Evicted:
+        """Give up one idle container, or all idle ones of an image.
+
+        Raises:
+            NotFoundError: there is no such container or image.
+            PayloadError: none is named, or both.
+            RefusedError: the one that is named works.
+        """
+        if bool(ask.container) == bool(ask.image):
+            raise PayloadError("neither a container nor an image is named, or both", remedy="name one of the two")
+        if ask.image:
+            self._check_image(ask.image)
+        held = [each for each in self.containers() if each.id == ask.container or each.image == ask.image]
+        if ask.container and not held:
+            known = ", ".join(each.id for each in self.containers())
+            raise NotFoundError(f"no container {ask.container[:60]!r} here", remedy=f"there are: {known or 'none'}")
+        kept = {each.id: why for each in held if (why := self._keeper.why_kept(each))}
+        if ask.container in kept:
+            raise RefusedError(
+                f"container {ask.container} is not idle: {kept[ask.container]}",
+                remedy="wait for its run to end, or cancel the task",
+            )
+        gone = tuple(each.id for each in held if each.id not in kept)
+        for each in gone:
+            self._keeper.give_up(each, "an operator gave it up")
+        floors = {each.image: self._config.floor.get(each.image, 0) for each in held if each.id not in kept}
+        note = "; ".join(f"the floor keeps {count} of {image}" for image, count in floors.items() if count)
+        return Evicted(containers=gone, kept=kept, note=note)
+
+    async def release_quarantine(self, ask: ReleaseAsk) -> Released:
+        """Start containers of an image again that kept failing.
+
+        Raises:
+            NotFoundError: there is no such image.
+            RefusedError: it is not in quarantine.
+        """
+        self._check_image(ask.image)
+        reason = self._keeper.release_quarantine(ask.image)
+        if not reason:
+            raise RefusedError(f"image {ask.image} is not in quarantine", remedy="swiftbot fleet shows which are")
+        log.info("quarantine released", image=ask.image, reason=reason)
+        return Released(image=ask.image, reason=reason)
+
+    def _count(self, image: str) -> tuple[int, int]:
+        states = [each.state for each in self.containers() if each.image == image]
+        return states.count(ContainerState.READY), states.count(ContainerState.STARTING)
+
+    def _no_warming(self) -> str:
+        if self._draining:
+            return f"{self.gateway} is draining"
+        return "pool.mode is cold: nothing is kept ready" if self._config.mode == "cold" else ""
+
+    def _check_image(self, image: str) -> None:
+        if image not in self._catalogue.images:
+            self.refused["unknown image"] += 1
+            raise NotFoundError(
+                f"no image {image[:60]!r}", remedy=f"known: {', '.join(sorted(self._catalogue.images))}"
+            )
 
     # --- running --------------------------------------------------------------------------------------------
 
