@@ -5,196 +5,24 @@ Runs as a user with a Podman API socket; anywhere else it fails and says why. Im
 
 import asyncio
 import contextlib
-import getpass
 import os
-import secrets
 import shutil
 import signal
 import sys
-import tempfile
-import textwrap
-from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from pool_bench import Bench, engine_ids
 
 from appliance.bench.startup import run as bench_startup
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
-from appliance.model import ContainerState, Need, Phase, RunEvent, RunEventKind, RunRequest, Site
+from appliance.model import ContainerState, Phase, RunEvent, RunEventKind
 from appliance.pool import images
-from appliance.pool.engine import PodmanEngine, remove_fleet, socket_path
-from appliance.pool.pool import Call, Pool
-from appliance.pool.selection import Candidate, Decision
+from appliance.pool.engine import PodmanEngine, remove_fleet
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue, ImageSpec, load_catalogue
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
-
-COLD = Decision(phase=Phase.COLD, gateway="g1")
-HANDLER = """
-import os, socket, time
-from pathlib import Path
-
-def attempt(work):
-    try:
-        work()
-    except OSError as error:
-        return type(error).__name__ + ": " + str(error.strerror)
-    return "done"
-
-def run(ctx):
-    do = ctx.params["do"]
-    if do == "echo":
-        return {"robot": ctx.robot}
-    if do == "call":
-        return {"answer": ctx.command("goto", x=1)["blobs"]["a"] == b"\\x00\\xff"}
-    if do == "sleep":
-        ctx.progress(0.1, "asleep")
-        time.sleep(60)
-    if do == "leave":
-        Path("/tmp/left").write_text("x")
-        Path("/dev/shm/left").write_text("x")
-        if os.fork() == 0:
-            os.setsid()
-            time.sleep(60)
-        return {}
-    if do == "look":
-        return {"files": sorted(os.listdir("/tmp") + os.listdir("/dev/shm")),
-                "processes": sorted(int(each) for each in os.listdir("/proc") if each.isdigit()), "me": os.getpid()}
-    if do == "harden":
-        lines = Path("/proc/self/status").read_text().splitlines()
-        status = dict(line.split(":\\t", 1) for line in lines if ":\\t" in line)
-        return {
-            "root": attempt(lambda: Path("/x").write_text("x")),
-            "usr": attempt(lambda: Path("/usr/x").write_text("x")),
-            "skills": attempt(lambda: Path("/skills/x").write_text("x")),
-            "runner": attempt(lambda: Path("/runner/x").write_text("x")),
-            "tmp": attempt(lambda: Path("/tmp/x").write_text("x")),
-            "fill": attempt(lambda: Path("/tmp/y").write_bytes(bytes(80 * 2**20))),
-            "net": attempt(lambda: socket.create_connection(("192.0.2.1", 80), 2)),
-            "interfaces": [name for _, name in socket.if_nameindex()],
-            "caps": [status[key] for key in ("CapEff", "CapPrm", "CapBnd", "CapInh", "CapAmb")],
-            "nnp": status["NoNewPrivs"], "seccomp": status["Seccomp"],
-            "chown": attempt(lambda: os.chown("/tmp/x", 1, 1)),
-            "mount": next(each[3] for each in map(str.split, open("/proc/mounts")) if each[1] == "/"),
-        }
-"""
-
-
-@pytest.fixture(scope="module")
-def podman() -> Path:
-    """Return the API socket's path; fails, with the reason, where this user has no Podman."""
-    try:
-        path = socket_path()
-    except PrerequisiteError as error:
-        pytest.fail(f"{getpass.getuser()} has no Podman: {error}")
-    if not path.is_socket():
-        pytest.fail(f"{getpass.getuser()} has no Podman: {path} is not there; run the tests as the service user")
-    return path
-
-
-@pytest.fixture
-def folder(podman: Path) -> Iterator[Path]:
-    """Return a folder of the test's own, with a deep name: socket paths must not mind."""
-    where = Path(tempfile.mkdtemp(prefix="swiftbot-test-")) / ("deep-" * 20)
-    where.mkdir()
-    yield where
-    shutil.rmtree(where.parent, ignore_errors=True)
-
-
-@pytest.fixture
-def catalogue(folder: Path) -> Catalogue:
-    """Return the real catalogue with one skill more, which does what it is told."""
-    skill = folder / "skills" / "probe"
-    skill.mkdir(parents=True)
-    (skill / "handler.py").write_text(textwrap.dedent(HANDLER))
-    (skill / "skill.toml").write_text(
-        'id = "probe"\ndomain = "coordination"\nsummary = "A test."\nruns = "compute"\n'
-        'image = "base"\ncpu = 0.2\nmemory_mb = 64\n'
-    )
-    return load_catalogue([skill.parent])
-
-
-@pytest.fixture
-async def built(podman: Path) -> None:
-    """Build the images that are missing."""
-    catalogue = load_catalogue()
-    for name in catalogue.images:
-        await images.build(name, catalogue)
-
-
-class Bench:
-    """Pools of one fleet of the test's own."""
-
-    def __init__(self, folder: Path, catalogue: Catalogue) -> None:
-        self.folder, self.catalogue = folder, catalogue
-        self.fleet = f"test-{secrets.token_hex(4)}"
-        self.pools: list[Pool] = []
-
-    async def pool(self, *, gateway: str = "g1", fleet: str = "", **settings: Any) -> Pool:
-        """Return a started pool."""
-
-        async def nobody(need: Need) -> list[Candidate]:
-            return []
-
-        async def answer(call: Call) -> dict[str, Any]:
-            return {"blobs": {"a": b"\x00\xff"}}
-
-        fleet = fleet or self.fleet
-        pool = Pool(
-            PoolConfig(**{"floor": {"base": 1}, "mode": "local", "cancel_grace_s": 0.5} | settings),
-            gateway=gateway,
-            fleet=fleet,
-            run_dir=self.folder / "run" / fleet / gateway,
-            catalogue=self.catalogue,
-            site=Site(),
-            find_remote=nobody,
-            on_call=answer,
-            on_change=lambda _: None,
-        )
-        self.pools.append(pool)
-        await pool.start()
-        return pool
-
-    @staticmethod
-    async def ready(pool: Pool, count: int = 1) -> None:
-        """Wait for so many ready containers."""
-        async with asyncio.timeout(60):
-            while sum(each.state is ContainerState.READY for each in pool.containers()) < count:
-                assert not pool.problem, pool.problem
-                await asyncio.sleep(0.02)
-
-    @staticmethod
-    def request(do: str, number: int = 1) -> RunRequest:
-        """Return an order."""
-        need = Need(image="base", cpu=0.2, memory_mb=64)
-        return RunRequest(task="t", subtask=f"s{number}", attempt=1, skill="probe", need=need, params={"do": do})
-
-    async def run(self, pool: Pool, do: str, number: int = 1, *, seen: list[RunEvent] | None = None) -> RunEvent:
-        """Select and run; returns the last event."""
-        request = self.request(do, number)
-        decision = await pool.select(request.need, allow_remote=False)
-        return await pool.run(request, decision, (seen if seen is not None else []).append)
-
-
-@pytest.fixture
-async def bench(built: None, folder: Path, catalogue: Catalogue) -> AsyncIterator[Bench]:
-    """Return a fleet of the test's own, removed afterwards."""
-    it = Bench(folder, catalogue)
-    yield it
-    for pool in it.pools:
-        await pool.stop(keep_containers=False)
-    await remove_fleet(it.fleet)
-
-
-async def _engine_ids(fleet: str, gateway: str = "g1") -> list[str]:
-    engine = PodmanEngine(threads=1)
-    try:
-        found = await engine.containers({"swiftbot.fleet": fleet, "swiftbot.gateway": gateway})
-    finally:
-        engine.close()
-    return [each.id for each in found]
 
 
 async def test_cold_then_warm(bench: Bench) -> None:
@@ -268,7 +96,7 @@ async def test_killed_from_outside(bench: Bench) -> None:
     async with asyncio.timeout(10):
         while not any(each.state is ContainerState.BUSY for each in pool.containers()):
             await asyncio.sleep(0.01)
-    (victim,) = await _engine_ids(bench.fleet)
+    (victim,) = await engine_ids(bench.fleet)
     engine = PodmanEngine(threads=1)
     await engine.remove(victim)
     engine.close()
@@ -276,7 +104,7 @@ async def test_killed_from_outside(bench: Bench) -> None:
     assert final.failure is not None
     assert (final.failure.code, final.failure.retryable) == ("pool", True)
     await bench.ready(pool)
-    assert victim not in await _engine_ids(bench.fleet)
+    assert victim not in await engine_ids(bench.fleet)
 
 
 async def test_adoption_after_a_kill(bench: Bench) -> None:
@@ -318,11 +146,11 @@ asyncio.run(main())
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(signal.SIGKILL)
         await process.wait()
-    left = set(await _engine_ids(bench.fleet))
+    left = set(await engine_ids(bench.fleet))
     assert len(left) == 2
     pool = await bench.pool(floor={"base": 2}, capacity=2)
     assert sum(each.state is ContainerState.READY for each in pool.containers()) == len(left)
-    assert set(await _engine_ids(bench.fleet)) == left
+    assert set(await engine_ids(bench.fleet)) == left
     results = [await bench.run(pool, "look", number) for number in range(4)]
     for final in results:
         assert final.phase is Phase.LOCAL_WARM
@@ -337,14 +165,14 @@ async def test_fleets_are_apart(bench: Bench) -> None:
         pools = [await bench.pool(), await bench.pool(gateway="g2"), await bench.pool(fleet=other)]
         for pool in pools:
             await bench.ready(pool)
-        ids = [set(await _engine_ids(*where)) for where in ((bench.fleet, "g1"), (bench.fleet, "g2"), (other, "g1"))]
+        ids = [set(await engine_ids(*where)) for where in ((bench.fleet, "g1"), (bench.fleet, "g2"), (other, "g1"))]
         assert all(ids)
         assert not ids[0] & ids[1]
         assert not ids[0] & ids[2]
         await pools[0].stop(keep_containers=False)
-        assert await _engine_ids(bench.fleet) == []
+        assert await engine_ids(bench.fleet) == []
         assert await remove_fleet(other) == 1
-        assert set(await _engine_ids(bench.fleet, "g2")) == ids[1]
+        assert set(await engine_ids(bench.fleet, "g2")) == ids[1]
         assert (await bench.run(pools[1], "echo")).kind is RunEventKind.SUCCEEDED
     finally:
         await remove_fleet(other)

@@ -1,0 +1,75 @@
+"""Fixtures of tests on real Podman; they run as a user with an API socket, and say so where there is none."""
+
+import getpass
+import shutil
+import tempfile
+import textwrap
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+from pool_bench import HANDLER, Bench
+
+from appliance.errors import PrerequisiteError
+from appliance.pool import images
+from appliance.pool.engine import remove_fleet, socket_path
+from appliance.skills.catalogue import Catalogue, load_catalogue
+
+
+@pytest.fixture(scope="module")
+def podman() -> Path:
+    """Return the API socket's path; fails, with the reason, where this user has no Podman."""
+    try:
+        path = socket_path()
+    except PrerequisiteError as error:
+        pytest.fail(f"{getpass.getuser()} has no Podman: {error}")
+    if not path.is_socket():
+        pytest.fail(f"{getpass.getuser()} has no Podman: {path} is not there; run the tests as the service user")
+    return path
+
+
+@pytest.fixture
+def folder(podman: Path) -> Iterator[Path]:
+    """Return a folder of the test's own, with a deep name: socket paths must not mind."""
+    where = Path(tempfile.mkdtemp(prefix="swiftbot-test-")) / ("deep-" * 20)
+    where.mkdir()
+    yield where
+    shutil.rmtree(where.parent, ignore_errors=True)
+
+
+@pytest.fixture
+def probe() -> tuple[str, str]:
+    """Return the handler of the skill `probe` and further lines of its manifest; a test module may have its own."""
+    return HANDLER, ""
+
+
+@pytest.fixture
+def catalogue(folder: Path, probe: tuple[str, str]) -> Catalogue:
+    """Return the real catalogue with one skill more, which does what it is told."""
+    skill = folder / "skills" / "probe"
+    skill.mkdir(parents=True)
+    source, manifest = probe
+    (skill / "handler.py").write_text(textwrap.dedent(source))
+    (skill / "skill.toml").write_text(
+        'id = "probe"\ndomain = "coordination"\nsummary = "A test."\nruns = "compute"\n'
+        'image = "base"\ncpu = 0.2\nmemory_mb = 64\n' + manifest
+    )
+    return load_catalogue([skill.parent])
+
+
+@pytest.fixture
+async def built(podman: Path) -> None:
+    """Build the images that are missing."""
+    catalogue = load_catalogue()
+    for name in catalogue.images:
+        await images.build(name, catalogue)
+
+
+@pytest.fixture
+async def bench(built: None, folder: Path, catalogue: Catalogue) -> AsyncIterator[Bench]:
+    """Return a fleet of the test's own, removed afterwards."""
+    it = Bench(folder, catalogue)
+    yield it
+    for pool in it.pools:
+        await pool.stop(keep_containers=False)
+    await remove_fleet(it.fleet)
