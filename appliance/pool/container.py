@@ -101,7 +101,6 @@ class PooledContainer:
         self.idle_since = time.monotonic()
         self.next_probe = 0.0
         self.missed_probes = 0
-        self.clock = 0.0
         self.rss_mb = 0.0
         self.first_rss_mb = 0.0
         self.problems: dict[str, str] = {}

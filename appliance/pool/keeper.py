@@ -21,6 +21,8 @@ from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool import policies
 from appliance.pool.container import PooledContainer
 from appliance.pool.engine import Engine, EngineFacts
+from appliance.pool.policies.greedy_dual import GreedyDual
+from appliance.pool.policies.planner import missing, victims
 from appliance.pool.selection import best_local
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
@@ -73,7 +75,7 @@ class Keeper:
         self._quarantine = policies.Quarantine(after=config.bad_starts, for_s=config.quarantine_s)
         self._asked: dict[str, tuple[int, float]] = {}
         """Containers of each image that somebody asked to have ready, and until when."""
-        self._clock = 0.0
+        self._evictor = GreedyDual()
         self._engine: Engine | None = None
         self._connecting: asyncio.Task[None] | None = None
         self._pause_s = config.reconnect_s
@@ -334,6 +336,7 @@ class Keeper:
         return self._free(self._starter.size(need.image, need).memory_mb, spare_floor=False, commit=commit)
 
     def _free(self, memory_mb: int, *, spare_floor: bool, commit: bool) -> tuple[policies.Idle, ...] | None:
+        now = time.monotonic()
         held = sum(each.info.memory_mb for each in self._pooled.values())
         idle = [
             policies.Idle(
@@ -342,21 +345,21 @@ class Keeper:
                 memory_mb=each.info.memory_mb,
                 runs=each.info.runs,
                 cold_ms=each.info.cold_ms or self.costs.of(each.info.image),
-                clock=each.clock,
+                since=each.idle_since,
             )
             for each in self._pooled.values()
             if each.info.state is ContainerState.READY
         ]
-        chosen = policies.victims(
+        chosen = victims(
             idle,
+            self._evictor.worths(idle, now),
             slots=len(self._pooled) + 1 - self._config.capacity,
             memory_mb=held + memory_mb - self._config.memory_mb,
-            floor=self._wanted(time.monotonic()),
-            spare_floor=spare_floor,
+            spare=self._wanted(now) if spare_floor else {},
         )
         if commit:
             for each in chosen or ():
-                self._clock = max(self._clock, policies.priority(each))
+                self._evictor.evicted(each, now)
                 # Those who wait are served when the new one has its place, not in between.
                 self.retire(self._pooled[each.id], "its place is needed", serve=False)
         return chosen
@@ -401,7 +404,6 @@ class Keeper:
         self.costs.add(image, cold_ms)
         log.info("container ready", image=image, container=container.id, took_ms=round(cold_ms))
         container.next_probe = time.monotonic() + self._config.probe_s
-        container.clock = self._clock
         if container.reservation != FOR_A_RUN:
             if self._config.mode == "cold":
                 self.retire(container, "nobody waits for it any more")
@@ -412,7 +414,6 @@ class Keeper:
     def ran(self, container: PooledContainer) -> None:
         """Note that a run in it has ended well swept, and make it ready, or replace it when it has had its day."""
         container.count_run()
-        container.clock = self._clock
         grown_mb = container.rss_mb - container.first_rss_mb
         if self._config.mode == "cold":
             self.retire(container, "mode is cold")
@@ -517,7 +518,7 @@ class Keeper:
     def _prewarm(self, now: float) -> None:
         wanted = self._wanted(now)
         coming = {image: self._count(image) for image in wanted}
-        for image in policies.wanted(wanted, coming):
+        for image in missing(wanted, coming):
             if len(self._starts) >= self._config.starts_at_once:
                 return
             if self._quarantine.reason(image, now):

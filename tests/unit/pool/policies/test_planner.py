@@ -5,7 +5,10 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.pool.policies import ColdCosts, Idle, Quarantine, priority, victims, wanted
+from appliance.pool.policies import ColdCosts, Idle, Planner, Quarantine, View
+from appliance.pool.policies.greedy_dual import GreedyDual
+from appliance.pool.policies.planner import missing, victims
+from appliance.pool.settings import PoolConfig
 
 idles = st.lists(
     st.builds(
@@ -15,9 +18,10 @@ idles = st.lists(
         memory_mb=st.integers(16, 2048),
         runs=st.integers(0, 100),
         cold_ms=st.floats(1, 5000),
-        clock=st.floats(0, 100),
+        since=st.floats(0, 100),
     ),
     max_size=8,
+    unique_by=lambda each: each.id,
 )
 floors = st.dictionaries(st.sampled_from(("base", "vision")), st.integers(0, 3))
 
@@ -27,10 +31,10 @@ def test_victims_free_enough_and_no_more(
     idle: list[Idle], slots: int, memory_mb: int, floor: dict[str, int], spare: bool
 ) -> None:
     """Those given up free what is needed, the last of them was needed, and floors are spared where asked."""
-    chosen = victims(idle, slots=slots, memory_mb=memory_mb, floor=floor, spare_floor=spare)
+    worths = GreedyDual().worths(idle, 100.0)
+    chosen = victims(idle, worths, slots=slots, memory_mb=memory_mb, spare=floor if spare else {})
     if chosen is None:
-        allowed = victims(idle, slots=len(idle) + 1, memory_mb=0, floor={}, spare_floor=False)
-        assert allowed is None
+        assert spare or slots > len(idle) or memory_mb > sum(each.memory_mb for each in idle)
         return
 
     def enough(some: tuple[Idle, ...]) -> bool:
@@ -38,7 +42,8 @@ def test_victims_free_enough_and_no_more(
 
     assert enough(chosen)
     assert not chosen or not enough(chosen[:-1])
-    assert [priority(each) for each in chosen] == sorted(priority(each) for each in chosen)
+    worth = dict(zip((each.id for each in idle), worths, strict=True))
+    assert [worth[each.id] for each in chosen] == sorted(worth[each.id] for each in chosen)
     if spare:
         before, taken = Counter(each.image for each in idle), Counter(each.image for each in chosen)
         assert all(before[image] - taken[image] >= min(before[image], floor.get(image, 0)) for image in before)
@@ -46,20 +51,35 @@ def test_victims_free_enough_and_no_more(
 
 def test_the_least_valuable_goes_first() -> None:
     """Large, cheap to start and seldom used goes before small, dear and often used; age levels that out."""
-    plain = {"image": "base", "memory_mb": 100, "runs": 1, "cold_ms": 100.0, "clock": 0.0}
+    policy = GreedyDual()
+    plain = {"image": "base", "memory_mb": 100, "runs": 1, "cold_ms": 100.0, "since": 0.0}
     used = Idle(id="used", **{**plain, "runs": 10})
     large = Idle(id="large", **{**plain, "memory_mb": 400})
-    fresh = Idle(id="fresh", **{**plain, "clock": 50.0})
-    chosen = victims([used, fresh, large], slots=2, memory_mb=0, floor={}, spare_floor=False)
-    assert chosen is not None
-    assert [each.id for each in chosen] == ["large", "used"]
+    assert policy.worths([used, large], 1.0) == [11.0, 0.5]
+    policy.evicted(Idle(id="other", **{**plain, "runs": 50}), 1.0)
+    fresh = Idle(id="fresh", **{**plain, "since": 2.0})
+    assert policy.worths([used, fresh, large], 3.0) == [11.0, 53.0, 0.5]
 
 
 @given(floors, st.dictionaries(st.sampled_from(("base", "vision")), st.integers(0, 4)))
-def test_wanted_fills_the_floor_exactly(floor: dict[str, int], coming: dict[str, int]) -> None:
+def test_missing_fills_the_floor_exactly(floor: dict[str, int], coming: dict[str, int]) -> None:
     """What is to be started brings every image to its floor, and none beyond."""
-    counts = Counter(wanted(floor, coming))
+    counts = Counter(missing(floor, coming))
     assert all(counts[image] == max(0, floor[image] - coming.get(image, 0)) for image in floor)
+
+
+def test_tend_fills_the_floor_and_lets_the_old_go() -> None:
+    """A container beyond the floor that was idle for idle_s goes; what the floor lacks is started, some at a time."""
+    settings = PoolConfig(floor={"base": 3, "vision": 1}, idle_s=100.0, starts_at_once=2)
+    planner = Planner(settings, ColdCosts(500.0), lambda _: 256)
+    old = tuple(
+        Idle(id=name, image="vision", memory_mb=256, runs=1, cold_ms=500.0, since=at)
+        for name, at in (("older", 0.0), ("old", 1.0), ("new", 90.0))
+    )
+    view = View(idle=old, memory_mb=768, containers=3, budget_mb=4096, capacity=8)
+    starts, retired = planner.tend(view, 110.0)
+    assert [each.image for each in starts] == ["base", "base"]
+    assert [each.id for each in retired] == ["older", "old"]
 
 
 def test_cold_costs_follow_what_is_measured() -> None:

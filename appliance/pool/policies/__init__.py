@@ -1,0 +1,18 @@
+"""What to keep, what to give up and what to start ahead, as plain code: state and event in, decisions out.
+
+Doors:
+    Planner      the one object the keeper (and the simulator) talks to
+    View, Idle   what it is shown; Start, Retire: what it answers
+    ColdCosts    what a cold start of an image costs here
+    Quarantine   images that do not start, and why
+
+Inside: planner; evictor (the interface) with greedy_dual and least_recent behind it.
+"""
+
+from appliance.pool.policies.costs import ColdCosts
+from appliance.pool.policies.evictor import Evictor
+from appliance.pool.policies.facts import Idle, Retire, Start, View
+from appliance.pool.policies.planner import Planner
+from appliance.pool.policies.quarantine import Quarantine
+
+__all__ = ["ColdCosts", "Evictor", "Idle", "Planner", "Quarantine", "Retire", "Start", "View"]
