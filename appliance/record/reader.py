@@ -1,10 +1,9 @@
-"""Reading logs back: what is in one, its messages, and making a proper file of an unfinished one.
+"""Reading logs back: what is in one, and its messages.
 
 A finished file is summed up from its index at once; any other is streamed (see `records`). Messages come in the
 order in which they were recorded, which is what a replay wants.
 """
 
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -13,13 +12,12 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Message, Metadata, Schema
 from mcap.summary import Summary
-from mcap.writer import Writer
 
 from appliance.errors import RecordError
 from appliance.record.expressions import compile_expression
 from appliance.record.facts import ChannelInfo, Deletion, Gap, LoggedMessage, LogInfo
 from appliance.record.records import BROKEN, RecordStream, open_log
-from appliance.record.writer import METADATA, VERSION
+from appliance.record.writer import METADATA
 
 _GAPS = compile_expression("swiftbot/*/recorder/*/gap")
 _DELETIONS = compile_expression("swiftbot/*/recorder/*/deleted")
@@ -72,7 +70,7 @@ def read(
             )
         elif isinstance(record, Message) and taken[record.channel_id]:
             channel = stream.channels[record.channel_id]
-            message = _logged(channel, record)
+            message = logged(channel, record)
             if message.key != channel.topic and not want(message.key):
                 continue
             count += 1
@@ -86,59 +84,8 @@ def read(
         )
 
 
-def recover(path: Path | str, out: Path | str) -> LogInfo:
-    """Write all that can be read of `path` as a proper, finished file `out`; return what is in that.
-
-    Raises:
-        NotFoundError: no such file.
-        RecordError: not an MCAP file, or `out` exists or cannot be written.
-    """
-    path, out = Path(path), Path(out)
-    if out.exists():
-        raise RecordError(f"{out} exists already", remedy="name a file that does not")
-    part = out.with_name(out.name + ".part")
-    open_log(path).close()
-    try:
-        with part.open("wb") as file:
-            _copy(RecordStream(path), Writer(file, chunk_size=64 * 1024))
-            file.flush()
-            os.fsync(file.fileno())
-        part.rename(out)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise RecordError(f"cannot write {out}: {error.strerror}", remedy="free space or name another file") from error
-    return info(out)
-
-
-def _copy(stream: RecordStream, writer: Writer) -> None:
-    """Copy records, giving schemas and channels new numbers (a file may announce them more than once)."""
-    writer.start(profile="", library=f"swiftbot {VERSION} recover")
-    schemas: dict[tuple[str, str, bytes], int] = {}
-    channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
-    numbers: dict[int, int] = {}
-    for record in stream:
-        if isinstance(record, Channel):
-            schema: Schema | None = stream.schemas.get(record.schema_id)
-            schema_number = 0
-            if schema is not None:
-                shape = (schema.name, schema.encoding, schema.data)
-                schema_number = schemas.get(shape) or writer.register_schema(*shape)
-                schemas[shape] = schema_number
-            like = (record.topic, record.message_encoding, schema_number, tuple(sorted(record.metadata.items())))
-            number = channels.get(like) or writer.register_channel(
-                record.topic, record.message_encoding, schema_number, record.metadata
-            )
-            channels[like] = numbers[record.id] = number
-        elif isinstance(record, Message):
-            writer.add_message(
-                numbers[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence
-            )
-        elif isinstance(record, Metadata):
-            writer.add_metadata(record.name, record.metadata)
-    writer.finish()
-
-
-def _logged(channel: Channel, message: Message) -> LoggedMessage:
+def logged(channel: Channel, message: Message) -> LoggedMessage:
+    """Return a record as the message it stands for: a deletion as the deletion of its key."""
     if _DELETIONS.fullmatch(channel.topic):
         try:
             deletion = msgspec.json.decode(message.data, type=Deletion)

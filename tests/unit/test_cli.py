@@ -8,7 +8,8 @@ from appliance import cli
 
 COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "fleet",
-    "pool", "robots", "log info", "log replay", "sim mavlink", "sim zenoh", "images build", "images list", "doctor",
+    "pool", "robots", "log info", "log replay", "log recover",
+    "log merge", "log trim", "log cat", "sim mavlink", "sim zenoh", "images build", "images list", "doctor",
     "tui", "bench startup",
 ]  # fmt: skip
 

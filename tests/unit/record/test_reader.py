@@ -10,8 +10,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from appliance.errors import NotFoundError, RecordError
+from appliance.record.edit import recover
 from appliance.record.facts import LoggedMessage
-from appliance.record.reader import info, read, recover
+from appliance.record.reader import info, read
 
 MAGIC_BYTES = 8
 
