@@ -106,7 +106,9 @@ class Gateway:
             self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
         )
         calls = Calls(self.plane, artifacts, on_wait=self._on_wait)
-        remote = RemoteContainers(self.plane, successors=config.plane.find_successors)
+        remote = RemoteContainers(
+            self.plane, successors=config.plane.find_successors, link_mb_per_s=config.pool.link_mb_per_s
+        )
 
         async def on_call(call: Call) -> dict[str, object]:
             return await calls(call)
@@ -119,10 +121,11 @@ class Gateway:
             catalogue=catalogue,
             site=site,
             find_remote=remote.find,
+            facts=remote.facts,
             on_call=on_call,
             on_change=self._on_containers,
         )
-        self.executor = Executor(self.plane, self.pool, config.tasks)
+        self.executor = Executor(self.plane, self.pool, remote, config.tasks)
         self.executor.on_change = self._changed.set
         await self.executor.start()
         await self.pool.start()

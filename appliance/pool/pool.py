@@ -15,7 +15,7 @@ import asyncio
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +43,14 @@ from appliance.model import (
     RunEventKind,
     RunRequest,
     Site,
+    Way,
 )
 from appliance.pool.api import EvictAsk, Evicted, Hinted, ReleaseAsk, Released, WarmAsk, Warmed
 from appliance.pool.container import Connection, PooledContainer
 from appliance.pool.conversation import Call, Conversation, order
 from appliance.pool.engine import Engine, PodmanEngine
 from appliance.pool.keeper import FOR_A_RUN, Keeper
-from appliance.pool.selection import Candidate, Decision, select
+from appliance.pool.selection import Candidate, Decision, Facts, select
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 from appliance.skills.catalogue import Catalogue
@@ -89,6 +90,7 @@ class Pool:
         catalogue: skills and images.
         site: the map that handlers get.
         find_remote: offers of other gateways for a need.
+        facts: what selection must know of the fleet for a need: where state is, what moving bytes costs.
         on_call: carries out what a handler asks of the appliance.
         on_change: told the facts of all containers whenever one of them changes.
         make_engine: Podman, unless a test says otherwise.
@@ -107,6 +109,7 @@ class Pool:
         catalogue: Catalogue,
         site: Site,
         find_remote: Callable[[Need], Awaitable[list[Candidate]]],
+        facts: Callable[[Need], Facts] = lambda _: Facts(),
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         make_engine: Callable[[], Engine] | None = None,
@@ -121,6 +124,7 @@ class Pool:
         self._catalogue = catalogue
         self._site: dict[str, Any] = msgspec.to_builtins(site)
         self._find_remote = find_remote
+        self._facts = facts
         self._on_call = on_call
         self._runs: dict[str, _Run] = {}
         self._idle = asyncio.Event()
@@ -191,8 +195,21 @@ class Pool:
 
     # --- selecting ------------------------------------------------------------------------------------------
 
-    async def select(self, need: Need, *, allow_remote: bool) -> Decision:
+    async def select(
+        self,
+        need: Need,
+        *,
+        allow_remote: bool,
+        inputs: Mapping[str, int] | None = None,
+        avoid: Mapping[str, str] | None = None,
+    ) -> Decision:
         """Decide where a subtask runs (Algorithm 1); a local container is reserved for the lease.
+
+        Args:
+            need: T = (image, cpu, mem, volumes).
+            allow_remote: whether other gateways may be asked (phase 2).
+            inputs: bytes of the subtask's input files by the gateway that holds them.
+            avoid: gateways whose containers are not to be used, with the reason.
 
         Raises:
             NotFoundError: there is no such image.
@@ -200,24 +217,27 @@ class Pool:
             PoolError: no container is ready and none can be started.
         """
         self._check(need)
-        decision = self._choose(need, [])
-        if decision.phase is Phase.COLD and allow_remote and self._config.mode == "federated":
+        facts = msgspec.structs.replace(self._facts(need), inputs=inputs or {}, avoid=avoid or {})
+        decision = self._choose(need, [], facts)
+        wanting = decision.phase is Phase.COLD or decision.way is Way.BRING_HERE
+        if wanting and allow_remote and self._config.mode == "federated":
+            # Not held while others are asked: a container that another run could use must not wait for that.
             offers: list[Candidate] = []
             try:
                 async with asyncio.timeout(self._config.remote_timeout_s):
                     offers = await self._find_remote(need)
             except (TimeoutError, SwiftbotError) as error:
                 log.info("other gateways could not be asked", reason=str(error) or "too slow")
-            decision = self._choose(need, offers)
+            decision = self._choose(need, offers, facts)
         if decision.phase is Phase.COLD:
             self._keeper.check_startable(need)
-        return decision
-
-    def _choose(self, need: Need, offers: list[Candidate]) -> Decision:
-        decision = select(need, self.containers(), offers, self.cold_ms(need.image), self._config, gateway=self.gateway)
-        if decision.phase is Phase.LOCAL_WARM and decision.container is not None:
+        elif decision.phase is Phase.LOCAL_WARM and decision.container is not None:
             return msgspec.structs.replace(decision, reservation=self._keeper.reserve(decision.container))
         return decision
+
+    def _choose(self, need: Need, offers: list[Candidate], facts: Facts) -> Decision:
+        cold_ms = self.cold_ms(need.image)
+        return select(need, self.containers(), offers, cold_ms, self._config, gateway=self.gateway, facts=facts)
 
     def _check(self, need: Need) -> None:
         self._check_image(need.image)

@@ -7,34 +7,43 @@ coordinator that comes later can ask.
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 import msgspec
 import structlog
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.errors import DeadlineError, PayloadError, PoolError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import (
+    Considered,
     Failure,
     Phase,
     RunAccepted,
     RunEvent,
     RunEventKind,
     RunRequest,
+    Way,
     encode,
 )
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
 from appliance.pool.pool import Call, Pool
-from appliance.pool.selection import Decision
+from appliance.pool.selection import MOST_CONSIDERED, Decision
 from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
+from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
 
 log = structlog.get_logger(__name__)
 
+REMOTE_TRIES = 3
+"""Other gateways that are tried for one run before what is here has to do."""
+ORDER_S = 2.0
+"""How long another gateway may take to accept a run."""
+MAX_VERDICT = 80
 KEPT_RUNS = 2000
 """Last events kept of ended runs; a coordinator asks within seconds."""
 
@@ -42,8 +51,9 @@ KEPT_RUNS = 2000
 class Executor:
     """The runs of one gateway."""
 
-    def __init__(self, plane: Plane, pool: Pool, config: TasksConfig) -> None:
+    def __init__(self, plane: Plane, pool: Pool, remote: RemoteContainers, config: TasksConfig) -> None:
         self._plane = plane
+        self._remote = remote
         self._config = config
         self._records: Closer | None = None
         self._pool = pool
@@ -122,27 +132,20 @@ class Executor:
         self._check(request)
         await self._end_older(request)
         received_ns = time.monotonic_ns()
-        decision = await self._pool.select(request.need, allow_remote=request.hops == 0)
-        if decision.phase is Phase.REMOTE_WARM:
-            self._check(request)
-            try:
-                return await self._plane.rpc.call(
-                    decision.gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=2.0
-                )
-            except DeadlineError as error:
-                # It may run there or not: only a new attempt, which ends this one wherever it is, is safe.
-                raise UnreachableError(f"{decision.gateway} did not say whether it runs {run_id}") from error
-            except SwiftbotError as error:
-                # The container was taken or its gateway went away meanwhile: what is left is here.
-                log.info("remote container lost", run=run_id, gateway=decision.gateway, reason=str(error))
-                decision = await self._pool.select(request.need, allow_remote=False)
+        decision = await self._decide(request)
+        if isinstance(decision, RunAccepted):
+            return decision
         if request.hops and decision.phase is Phase.COLD:
             raise RefusedError(f"{self._plane.gateway} has no ready container of {request.need.image} any more")
         # Much may have happened while other gateways were asked.
         self._check(request)
         phase = Phase.REMOTE_WARM if request.hops else decision.phase
         accepted = RunAccepted(
-            gateway=self._plane.gateway, container=decision.container or "", phase=phase, why=decision.why
+            gateway=self._plane.gateway,
+            container=decision.container or "",
+            phase=phase,
+            why=decision.why,
+            choice=decision.choice,
         )
         self._accepted[run_id] = accepted
         begun = RunEvent(
@@ -159,6 +162,39 @@ class Executor:
         task.add_done_callback(lambda done: self._ended(run_id, done))
         self.on_change()
         return accepted
+
+    async def _decide(self, request: RunRequest) -> Decision | RunAccepted:
+        """Select a container; one on another gateway is reserved and started there by the order to run itself.
+
+        An offer that turns out to be nothing is counted, explained in the choice, and the next best is taken; the
+        last try is without other gateways.
+        """
+        remote, inputs = self._remote, bytes_by_gateway(request.inputs)
+        avoid = remote.left_out()
+        for left in reversed(range(REMOTE_TRIES + 1)):
+            decision = await self._pool.select(
+                request.need, allow_remote=request.hops == 0 and left > 0, inputs=inputs, avoid=avoid
+            )
+            if decision.phase is not Phase.REMOTE_WARM:
+                return _explained(decision, avoid)
+            self._check(request)
+            gateway = decision.gateway
+            try:
+                accepted = await self._plane.rpc.call(
+                    gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
+                )
+            except DeadlineError as error:
+                # It may run there or not: only a new attempt, which ends this one wherever it is, is safe.
+                raise UnreachableError(f"{gateway} did not say whether it runs {request.run_id}") from error
+            except SwiftbotError as error:
+                # The container was taken, or was never there, or its gateway went away meanwhile.
+                remote.turned_out(gateway, good=False)
+                avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}
+                self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
+            else:
+                remote.turned_out(gateway, good=True)
+                return _passed_on(accepted, _explained(decision, avoid))
+        raise PoolError("a selection without other gateways chose one")
 
     def _check(self, request: RunRequest) -> None:
         """Refuse what must not begin (any more)."""
@@ -328,6 +364,32 @@ class Executor:
                 self._records.close()
             if self._background:
                 await asyncio.wait(list(self._background), timeout=2.0)
+
+
+def _explained(decision: Decision, avoid: Mapping[str, str]) -> Decision:
+    """Have the choice name the gateways that were left out, also those that selection did not hear of again."""
+    choice = decision.choice
+    if choice is None or not avoid:
+        return decision
+    told = {each.gateway for each in choice.considered}
+    missing = tuple(
+        Considered(gateway=gateway, way=Way.RUN_THERE, verdict=reason)
+        for gateway, reason in avoid.items()
+        if gateway not in told
+    )
+    considered = (*choice.considered[: MOST_CONSIDERED - len(missing)], *missing)
+    return replace(decision, choice=replace(choice, considered=considered[:MOST_CONSIDERED]))
+
+
+def _passed_on(accepted: RunAccepted, decision: Decision) -> RunAccepted:
+    """The other gateway's answer with the reasons of the one that chose it; it picks the container itself."""
+    choice = decision.choice
+    if choice is None:
+        return accepted
+    choice = replace(choice, gateway=accepted.gateway, container=accepted.container)
+    if accepted.choice is not None and accepted.choice.way is Way.BRING_HERE:
+        choice = replace(choice, why=f"{choice.why}; there {accepted.choice.why}")
+    return replace(accepted, why=decision.why, choice=choice)
 
 
 def _number(run_id: str) -> int:

@@ -12,7 +12,6 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable
-from typing import cast
 
 import structlog
 from msgspec.structs import replace
@@ -52,7 +51,7 @@ from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.placement import Placement, bind, place
+from appliance.tasks.placement import Placement, bind, holds, place
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, need_of, task_key
 
@@ -358,12 +357,13 @@ class TaskManager:
     def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
         """Order the gateways for a subtask by the coarse score."""
         registry = self.plane.registry
+        need = need_of(self.manifest(target.subtask.skill))
         return place(
-            need_of(self.manifest(target.subtask.skill)),
+            need,
             here=self.plane.gateway,
             gateways={name: status for name, status in registry.gateways.items() if name in self.plane.members()},
             containers=registry.containers,
-            holds=_holds(record, target),
+            holds=holds(record, target, need.volumes, registry.gateways),
             robot=registry.robots.get(robot) if robot else None,
             avoid=frozenset(each.gateway for each in target.attempts if each.failure),
             config=self.config,
@@ -442,26 +442,3 @@ class TaskManager:
                 return record
             await asyncio.sleep(0.1)
         raise UnreachableError(f"nobody coordinates task {ask.id} just now", remedy="try again in a second")
-
-
-def _holds(record: TaskRecord, target: SubtaskRecord) -> dict[str, float]:
-    """Share of the input files each gateway holds, over the results of the direct predecessors."""
-    held: dict[str, float] = {}
-    for before in target.subtask.after:
-        for gateway in _gateways_in(record.of(before).result):
-            held[gateway] = held.get(gateway, 0.0) + 1.0
-    total = sum(held.values())
-    return {gateway: count / total for gateway, count in held.items()}
-
-
-def _gateways_in(value: object) -> list[str]:
-    """Gateways named by artifact references anywhere in a result."""
-    if isinstance(value, dict):
-        table = cast("dict[str, object]", value)
-        gateway = table.get("gateway")
-        if "artifact" in table and isinstance(gateway, str):
-            return [gateway]
-        return [found for each in table.values() for found in _gateways_in(each)]
-    if isinstance(value, list | tuple):
-        return [found for each in cast("list[object]", value) for found in _gateways_in(each)]
-    return []

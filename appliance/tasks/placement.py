@@ -1,10 +1,10 @@
 """Coarse scheduling as a pure function: which gateway should a subtask be sent to, and why.
 
 score(gateway) = w_l · (1 − load) + w_d · proximity + w_w · warm (paper, two-level scheduling; `algorithms.md`),
-with proximity = share of the subtask's input files held there, or 1 where its robot's link is and there are no
-files, and warm = 1 if a ready container of the image is there, 0.5 for a compatible one. A gateway that is
-draining, cannot start containers and has none ready, or failed this subtask before while others remain, is no
-candidate. Ties go to the gateway that asks: it is a network hop nearer.
+with proximity = share of the bytes of its input files and state volumes held there, or 1 where its robot's link
+is and there are none, and warm = 1 if a ready container of the image is there, 0.5 for a compatible one. A gateway
+that is draining, cannot start containers and has none ready, or failed this subtask before while others remain, is
+no candidate. Ties go to the gateway that asks: it is a network hop nearer.
 """
 
 import re
@@ -12,7 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from msgspec import Struct
 
-from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, SubtaskRecord
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, SubtaskRecord, TaskRecord
+from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.settings import TasksConfig
 
 _ANY = re.compile(r"any\d{0,2}")
@@ -44,7 +45,7 @@ def place(
         here: the asking gateway.
         gateways: present gateways by id.
         containers: their pooled containers by gateway and id.
-        holds: gateway -> share (0 to 1) of the input files it holds.
+        holds: gateway -> share (0 to 1) of the subtask's data it holds (function `holds`).
         robot: the robot it commands, if any.
         avoid: gateways where an attempt at it failed; used only when nothing else is left.
         config: the weights.
@@ -72,6 +73,25 @@ def place(
     if not scored:
         return Placement(order=(), why="; ".join(reasons) or "no gateway is present")
     return Placement(order=tuple(row[2] for row in scored), why=", ".join([row[3] for row in scored] + reasons))
+
+
+def holds(
+    record: TaskRecord, target: SubtaskRecord, volumes: Iterable[str], gateways: Mapping[str, GatewayStatus]
+) -> dict[str, float]:
+    """Share of a subtask's data that each gateway holds: input files of direct predecessors, and its state volumes.
+
+    By bytes, so that a video counts for more than the report on it.
+    """
+    held = bytes_by_gateway([record.of(before).result for before in target.subtask.after])
+    wanted = frozenset(volumes)
+    for gateway, status in gateways.items():
+        for each in status.volumes:
+            if each.name in wanted and each.gateway == gateway:
+                held[gateway] = held.get(gateway, 0) + each.size_bytes
+    total = sum(held.values())
+    if not total:
+        return {gateway: 1 / len(held) for gateway in held}
+    return {gateway: size / total for gateway, size in held.items()}
 
 
 def _warm(need: Need, containers: Iterable[ContainerInfo]) -> float:

@@ -1,55 +1,92 @@
 """Phase 2 of container selection, finding a ready container elsewhere (paper, Algorithm 1, distributed search).
 
 The k successors of hash(image) are asked; each answers with the ready containers it knows of, its own and those
-it has heard of. The cost of using one is the measured round trip to its gateway, kept as a moving average.
+it has heard of. What selection must know beside them comes from here too: the measured round trip to each gateway
+(a moving average), what moving bytes costs, and where the newest state of a volume is. A gateway whose offers turn
+out to be nothing, several times in a row, is left out for a while: it is out of date, or it lies.
 """
 
 import asyncio
 import time
+from collections.abc import Callable
+
+from msgspec import Struct
 
 from appliance.errors import SwiftbotError
-from appliance.model import ContainerInfo, ContainerState, Need
+from appliance.model import ContainerInfo, ContainerState, Need, VolumeInfo
 from appliance.plane.node import Plane
-from appliance.pool.selection import Candidate
+from appliance.pool.selection import MB, Candidate, Facts
 from appliance.tasks.api import ContainerList
 
 ASK_TIMEOUT_S = 0.15
 """A neighbour slower than this is no help: a cold start costs about as much."""
 UNKNOWN_ROUND_TRIP_MS = 5.0
+EMPTY_OFFERS = 3
+"""Offers in a row that were nothing, after which a gateway is left out; one or two are lost races."""
+LEFT_OUT_S = 10.0
+
+
+class _Trust(Struct):
+    """How a gateway's offers have turned out."""
+
+    empty: int = 0
+    until: float = 0.0
 
 
 class RemoteContainers:
-    """Finds ready containers on other gateways, and answers when others look for ours."""
+    """Finds ready containers on other gateways, and answers when others look for ours.
 
-    def __init__(self, plane: Plane, *, successors: int) -> None:
+    Args:
+        plane: the fleet.
+        successors: how many neighbours on the ring are asked.
+        link_mb_per_s: megabytes a second to a gateway, where nothing better is known.
+    """
+
+    def __init__(self, plane: Plane, *, successors: int, link_mb_per_s: float) -> None:
         self._plane = plane
         self._successors = successors
+        self._ms_per_byte = 1e3 / (link_mb_per_s * MB)
         self._round_trip_ms: dict[str, float] = {}
+        self._trust: dict[str, _Trust] = {}
+        plane.on_member_lost.append(self._forget)
 
     async def find(self, need: Need) -> list[Candidate]:
-        """Ready containers on other gateways that could serve a need, each with its cost."""
+        """Containers on other gateways that could serve a need, in any state, each with its round trip."""
         here = self._plane.gateway
         asked = [each for each in self._plane.ring.successors(f"image/{need.image}", self._successors) if each != here]
-        found: dict[str, ContainerInfo] = {each.id: each for each in self._known(need)}
+        found = {(each.gateway, each.id): each for each in self._known(need)}
         answers = await asyncio.gather(*(self._ask(each, need) for each in asked))
-        for containers in answers:
-            # What a gateway says of its own containers is newer than what was heard.
-            found.update({each.id: each for each in containers})
+        for gateway, containers in zip(asked, answers, strict=True):
+            if containers is None:
+                continue
+            # What a gateway says of its own containers is newer than what was heard of them.
+            own = {each.id for each in containers if each.gateway == gateway}
+            stale = [
+                key
+                for key, each in found.items()
+                if each.gateway == gateway and each.state is ContainerState.READY and each.id not in own
+            ]
+            for key in stale:
+                del found[key]
+            for each in containers:
+                key = (each.gateway, each.id)
+                if each.gateway == gateway or (each.gateway not in asked and key not in found):
+                    found[key] = each
         members = self._plane.members()
         return [
-            Candidate(container=each, cost_ms=self._round_trip_ms.get(each.gateway, UNKNOWN_ROUND_TRIP_MS))
+            Candidate(container=each, round_trip_ms=self._round_trip_ms.get(each.gateway, UNKNOWN_ROUND_TRIP_MS))
             for each in found.values()
             if each.gateway != here and each.gateway in members
         ]
 
-    async def _ask(self, gateway: str, need: Need) -> tuple[ContainerInfo, ...]:
+    async def _ask(self, gateway: str, need: Need) -> tuple[ContainerInfo, ...] | None:
         began = time.monotonic()
         try:
             answer = await self._plane.rpc.call(
                 gateway, "find_containers", need, ContainerList, timeout_s=ASK_TIMEOUT_S
             )
         except SwiftbotError:
-            return ()
+            return None
         took_ms = (time.monotonic() - began) * 1e3
         before = self._round_trip_ms.get(gateway, took_ms)
         self._round_trip_ms[gateway] = 0.8 * before + 0.2 * took_ms
@@ -60,9 +97,56 @@ class RemoteContainers:
             each
             for containers in self._plane.registry.containers.values()
             for each in containers.values()
-            if each.state is ContainerState.READY and (each.image == need.image or need.image in each.compatible)
+            if each.image == need.image or need.image in each.compatible
         ]
 
     async def answer(self, need: Need) -> ContainerList:
         """Answer `find_containers`: the ready containers this gateway knows of."""
-        return ContainerList(containers=tuple(self._known(need)))
+        return ContainerList(containers=tuple(each for each in self._known(need) if each.state is ContainerState.READY))
+
+    # --- what selection must know beside them -------------------------------------------------------------------
+
+    def facts(self, need: Need) -> Facts:
+        """Where the newest state of the volumes asked for is, and what moving bytes costs."""
+        newest = {name: found for name in need.volumes if (found := self._newest(name)) is not None}
+        return Facts(volumes=newest, transfer_ms=self._transfer_ms)
+
+    def _newest(self, volume: str) -> VolumeInfo | None:
+        members = self._plane.members()
+        known = [
+            each
+            for gateway, status in self._plane.registry.gateways.items()
+            for each in status.volumes
+            if each.name == volume and each.gateway == gateway and gateway in members
+        ]
+        return max(
+            known, key=lambda each: (each.generation, each.gateway == self._plane.gateway, each.gateway), default=None
+        )
+
+    def _transfer_ms(self, size: int, gateway: str) -> float:
+        return size * self._ms_per_byte + self._round_trip_ms.get(gateway, UNKNOWN_ROUND_TRIP_MS)
+
+    # --- how offers turn out --------------------------------------------------------------------------------------
+
+    def left_out(self, now: Callable[[], float] = time.monotonic) -> dict[str, str]:
+        """Gateways whose offers are not to be used just now, with the reason."""
+        at = now()
+        return {
+            gateway: f"its last {trust.empty} offers were nothing"
+            for gateway, trust in self._trust.items()
+            if trust.until > at
+        }
+
+    def turned_out(self, gateway: str, *, good: bool, now: Callable[[], float] = time.monotonic) -> None:
+        """Note whether a container that a gateway offered was there."""
+        if good:
+            self._trust.pop(gateway, None)
+            return
+        trust = self._trust.setdefault(gateway, _Trust())
+        trust.empty += 1
+        if trust.empty >= EMPTY_OFFERS:
+            trust.until = now() + LEFT_OUT_S
+
+    def _forget(self, gateway: str) -> None:
+        self._round_trip_ms.pop(gateway, None)
+        self._trust.pop(gateway, None)

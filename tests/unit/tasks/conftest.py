@@ -6,7 +6,7 @@ records that move on, gateways that vanish, without processes, sockets or contai
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -207,6 +207,10 @@ class FakeRing:
         """Return it."""
         return self.name
 
+    def successors(self, key: str, count: int) -> tuple[str, ...]:
+        """Return three."""
+        return ("gw-1", "gw-2", "gw-3")[:count]
+
 
 class FakePlane:
     """A plane in memory."""
@@ -241,11 +245,15 @@ class FakePool:
         self.decision = Decision(phase=Phase.LOCAL_WARM, gateway="gw-1", container="c1", why="warm")
         self.decisions: list[Decision] = []
         self.gate: asyncio.Event | None = None
+        self.asked: list[tuple[bool, dict[str, int], dict[str, str]]] = []
         self.cancelled: list[str] = []
         self.runs: dict[str, asyncio.Future[RunEvent]] = {}
 
-    async def select(self, need: Need, *, allow_remote: bool) -> Decision:
+    async def select(
+        self, need: Need, *, allow_remote: bool, inputs: Mapping[str, int], avoid: Mapping[str, str]
+    ) -> Decision:
         """Return the prepared decision."""
+        self.asked.append((allow_remote, dict(inputs), dict(avoid)))
         if self.gate is not None:
             await self.gate.wait()
         return self.decisions.pop(0) if self.decisions else self.decision

@@ -21,6 +21,7 @@ from appliance.model import (
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk
 from appliance.tasks.executor import Executor
+from appliance.tasks.remote import RemoteContainers
 
 pytestmark = pytest.mark.anyio
 
@@ -32,7 +33,7 @@ AWAY = Decision(phase=Phase.REMOTE_WARM, gateway="gw-2", container="c2")
 @pytest.fixture
 async def executor(plane: Any, pool: Any, tasks_config: Any) -> Executor:
     """Return an executor that hears records."""
-    made = Executor(plane, pool, tasks_config)
+    made = Executor(plane, pool, RemoteContainers(plane, successors=3, link_mb_per_s=50), tasks_config)
     await made.start()
     return made
 
@@ -191,7 +192,7 @@ async def test_a_restart_tells_of_lost_runs_and_skips_what_it_cannot_read(
     """A run in progress at the end has failed, retryable; a damaged row does not keep the gateway from starting."""
     begun = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.STARTED)
     plane.store.values = {"run/t-1/s1/1": encode(begun), "run/t-1/s2/1": b"\xff"}
-    executor = Executor(plane, pool, tasks_config)
+    executor = Executor(plane, pool, RemoteContainers(plane, successors=3, link_mb_per_s=50), tasks_config)
     await executor.start()
     status = await executor.status(ASK)
     assert not status.running
