@@ -131,7 +131,7 @@ async def test_remote(bench: Any) -> None:
     """With none ready here, an offer of another gateway is taken; a run for it is not accepted here."""
     pool = await bench.pool(mode="federated")
     there = ContainerInfo(id="far", gateway="g2", image="base", state=ContainerState.READY)
-    bench.offers = [Candidate(container=there, cost_ms=1.0)]
+    bench.offers = [Candidate(container=there, round_trip_ms=1.0)]
     need = bench.request().need
     decision = await pool.select(need, allow_remote=True)
     assert (decision.phase, decision.gateway, decision.container) == (Phase.REMOTE_WARM, "g2", "far")
