@@ -133,6 +133,22 @@ def log_cat(
     return 1 if damaged else 0
 
 
+@log_app.command(name="pin")
+def log_pin(paths: tuple[Path, ...], *, remove: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Keep logs whatever the recorder's disk budget says (an incident, say); --remove lets them go with the others.
+
+    Args:
+        paths: The logs.
+        remove: Unpin them.
+    """
+    from appliance.record.budget import pin
+
+    for path in paths:
+        pin(path, pinned=not remove)
+        console.out.print(f"{path} is {'no longer pinned' if remove else 'pinned'}", markup=False)
+    return 0
+
+
 @log_app.command(name="replay")
 def log_replay(path: Path, *, as_json: Json = False) -> int:
     """Fold a log's transitions through the task state machine and compare the end states; 1 when they differ."""

@@ -19,6 +19,7 @@ from msgspec import Struct
 
 from appliance.errors import RecordError
 from appliance.plane.keys import Keys
+from appliance.record.budget import make_room
 from appliance.record.facts import Deletion, Gap, LoggedMessage
 from appliance.record.logfile import LogFile, free_bytes
 from appliance.record.schemas import ChannelKind, KeySchemas
@@ -96,6 +97,9 @@ class LogWriter:
         self.messages = 0
         self.files: list[Path] = []
         self.dropped: dict[str, int] = {}
+        self.removed = 0
+        """Old files removed to stay within `total_bytes`."""
+        self._prefix = f"{fleet}-{config.name}-"
         self._keys = Keys(fleet)
         self._schemas = KeySchemas(self._keys)
         self._clock, self._wall, self._free, self._open_file = clock, wall, free, open_file
@@ -248,11 +252,15 @@ class LogWriter:
         return self._current
 
     def _start(self, now: float) -> _Open:
+        if self.config.total_bytes:
+            # Room for the file that begins now, too.
+            room = self.config.total_bytes - self.config.rotate_bytes
+            self.removed += make_room(self.config.folder, self._prefix, budget_bytes=room)
         started_ns = self._wall()
         stamp = datetime.fromtimestamp(started_ns / 1e9, tz=UTC)
         while True:
             self._sequence += 1
-            name = f"{self.fleet}-{self.config.name}-{stamp:%Y%m%dT%H%M%SZ}-{self._sequence:04d}.mcap"
+            name = f"{self._prefix}{stamp:%Y%m%dT%H%M%SZ}-{self._sequence:04d}.mcap"
             try:
                 file = self._open_file(self.config.folder / name)
                 break

@@ -70,7 +70,8 @@ def _message(number: int, size: int = 20) -> LoggedMessage:
 
 
 def _writer(folder: Path, clock: Clock | None = None, **changes: Any) -> LogWriter:
-    config = RecordConfig(**({"directory": str(folder), "free_bytes": 0, "fsync": False} | changes))
+    plain = {"directory": str(folder), "free_bytes": 0, "fsync": False, "total_bytes": 0}
+    config = RecordConfig(**(plain | changes))
     writer = LogWriter(config, fleet="f1", clock=clock or Clock())
     writer.prepare()
     return writer
@@ -137,6 +138,22 @@ def test_rotation_by_size(tmp_path: Path) -> None:
     assert len(writer.files) > 3
     assert _numbers(writer.files) == list(range(300))
     assert not any(info(path).recovered for path in writer.files)
+
+
+def test_old_files_go_when_the_budget_is_spent(tmp_path: Path) -> None:
+    """All files together stay within `total_bytes`; what is left are the newest, unbroken, and it is counted."""
+    clock = Clock()
+    writer = _writer(tmp_path, clock, rotate_bytes=2_000, total_bytes=8_000, chunk_bytes=300, compression="none")
+    for number in range(400):
+        writer.write(_message(number))
+        clock.now += 1
+        writer.tick()
+    writer.close()
+    left = sorted(tmp_path.glob("*.mcap"))
+    assert sum(path.stat().st_size for path in left) <= 8_000 + 2_000  # a file's index comes on top of its messages
+    assert writer.removed == len(writer.files) - len(left) > 0
+    numbers = _numbers(left)
+    assert numbers == list(range(numbers[0], 400))
 
 
 def test_rotation_by_time_and_by_channels(tmp_path: Path) -> None:
