@@ -35,5 +35,6 @@ class GreedyDual:
     def evicted(self, idle: Idle, now: float) -> None:
         """Set the clock to the priority of the one given up."""
         del now
-        _, clock = self._marks.pop(idle.id, (0.0, self._clock))
-        self._clock = max(self._clock, clock + (idle.runs + 1) * idle.cold_ms / idle.memory_mb)
+        mark = self._marks.pop(idle.id, None)
+        if mark is not None:
+            self._clock = max(self._clock, mark[1] + (idle.runs + 1) * idle.cold_ms / idle.memory_mb)

@@ -1,0 +1,94 @@
+"""What has been asked of each image here: how often, for how long, and how many at a time.
+
+Concurrency is seen as levels: the n-th container of an image is wanted while n runs are there at once. The idle
+time of level n is from the moment the number of runs falls below n to the moment it rises to n again. So one
+histogram of idle times a level says for the first, second, third … container of an image what the published
+policies say for the only one.
+"""
+
+from appliance.pool.policies.idle_times import IdleTimes
+
+MAX_IMAGES = 256
+MAX_LEVELS = 16
+"""Levels beyond share no histogram: they are left to the rate."""
+FADE = 0.2
+"""Weight of the newest in moving averages: about the last nine count."""
+
+
+class ImageDemand:
+    """The demand for one image."""
+
+    __slots__ = ("_gap_s", "arrivals", "fell", "last", "levels", "runs", "service_s")
+
+    def __init__(self) -> None:
+        self.arrivals = 0
+        self.runs = 0
+        """Runs that are here now."""
+        self.last = 0.0
+        """When the last one arrived."""
+        self.service_s = 1.0
+        self.fell: list[float | None] = [None] * MAX_LEVELS
+        """When the number of runs last fell below each level."""
+        self.levels: list[IdleTimes] = []
+        self._gap_s = 0.0
+
+    def arrived(self, now: float) -> None:
+        """Note a run that begins or wants to."""
+        if self.arrivals:
+            gap_s = now - self.last
+            self._gap_s = gap_s if self.arrivals == 1 else self._gap_s + FADE * (gap_s - self._gap_s)
+        self.arrivals += 1
+        self.last = now
+        self.runs += 1
+        if self.runs <= MAX_LEVELS:
+            fell = self.fell[self.runs - 1]
+            if fell is not None:
+                while len(self.levels) < self.runs:
+                    self.levels.append(IdleTimes())
+                self.levels[self.runs - 1].add(now - fell)
+
+    def ended(self, service_s: float, now: float) -> None:
+        """Note the end of a run."""
+        if service_s > 0:
+            self.service_s += FADE * (service_s - self.service_s)
+        if 0 < self.runs <= MAX_LEVELS:
+            self.fell[self.runs - 1] = now
+        self.runs = max(0, self.runs - 1)
+
+    def gap_s(self, now: float) -> float:
+        """Return the expected time between two arrivals; a silence longer than that counts as one gap more."""
+        if self.arrivals < 2:
+            return max(86_400.0, now - self.last)
+        silence_s = now - self.last
+        return self._gap_s + FADE * (silence_s - self._gap_s) if silence_s > self._gap_s else self._gap_s
+
+    def idle_times(self, level: int) -> IdleTimes | None:
+        """Return the histogram of a level (1 is the first), if there is one."""
+        return self.levels[level - 1] if 0 < level <= len(self.levels) else None
+
+    def idle_since(self, level: int, otherwise: float) -> float:
+        """Return when a level was last wanted."""
+        fell = self.fell[level - 1] if 0 < level <= MAX_LEVELS else None
+        return otherwise if fell is None else fell
+
+
+class Demand:
+    """The demand for all images, of which the 256 asked for last are kept."""
+
+    def __init__(self) -> None:
+        self.images: dict[str, ImageDemand] = {}
+
+    def arrived(self, image: str, now: float) -> ImageDemand:
+        """Note a run that begins or wants to."""
+        found = self.images.pop(image, None) or ImageDemand()
+        self.images[image] = found  # the newest last
+        if len(self.images) > MAX_IMAGES:
+            del self.images[next(iter(self.images))]
+        found.arrived(now)
+        return found
+
+    def ended(self, image: str, service_s: float, now: float) -> None:
+        """Note the end of a run."""
+        found = self.images.get(image)
+        if found is not None:
+            found.ended(service_s, now)
