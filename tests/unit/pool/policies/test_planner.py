@@ -56,7 +56,9 @@ def test_the_least_valuable_goes_first() -> None:
     used = Idle(id="used", **{**plain, "runs": 10})
     large = Idle(id="large", **{**plain, "memory_mb": 400})
     assert policy.worths([used, large], 1.0) == [11.0, 0.5]
-    policy.evicted(Idle(id="other", **{**plain, "runs": 50}), 1.0)
+    other = Idle(id="other", **{**plain, "runs": 50})
+    policy.worths([used, large, other], 1.0)
+    policy.evicted(other, 1.0)
     fresh = Idle(id="fresh", **{**plain, "since": 2.0})
     assert policy.worths([used, fresh, large], 3.0) == [11.0, 53.0, 0.5]
 
