@@ -33,7 +33,7 @@ from appliance.model import (
     TaskRequest,
 )
 from appliance.plane.node import Plane
-from appliance.pool.api import EvictAsk, ReleaseAsk, WarmAsk
+from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.pool import Call, Pool
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
@@ -137,10 +137,11 @@ class Gateway:
         rpc.register("run_cancel", RunAsk, self.executor.cancel)
         rpc.register("artifact", ArtifactAsk, artifacts.piece)
         rpc.register("find_containers", Need, remote.answer)
-        rpc.register("pool_hint", PoolHint, self.pool.hint)
-        rpc.register("pool_warm", WarmAsk, self.pool.warm)
-        rpc.register("pool_evict", EvictAsk, self.pool.evict)
-        rpc.register("pool_release_quarantine", ReleaseAsk, self.pool.release_quarantine)
+        rpc.register("pool_hint", PoolHint, self.pool.verbs.hint)
+        rpc.register("pool_warm", WarmAsk, self.pool.verbs.warm)
+        rpc.register("pool_evict", EvictAsk, self.pool.verbs.evict)
+        rpc.register("pool_release_quarantine", ReleaseAsk, self.pool.verbs.release_quarantine)
+        rpc.register("pool_decisions", DecisionsAsk, self.pool.verbs.decisions)
 
         self.manager = TaskManager(
             config.tasks,

@@ -1,89 +1,87 @@
-"""Keeps the containers: the books of who is there and who has which, and the tending of both.
+"""Keeps the containers: starts them ahead and for those who wait, probes them, replaces them, gives them up.
 
 It exists apart from the door (`pool.py`) because runs come and go by the second while containers have a life of
-their own: they are started ahead, probed, leased, given up, lost and found. It decides nothing itself
-(`selection`, `policies`) and touches no container itself (`starter`, `container`); it only makes sure that the
-books are right, at every step between two awaits.
+their own. It decides nothing itself (`policies`) and touches no container itself (`starter`, `container`): it shows
+the planner what there is, carries out what that answers, and notes why (`decisions`). Who has which container is in
+the books (`books`); Podman is behind the link (`link`).
 """
 
 import asyncio
 import contextlib
-import secrets
+import math
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Coroutine
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
 import structlog
 
 from appliance.errors import PoolError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import ContainerInfo, ContainerState, Need
-from appliance.pool import policies
+from appliance.model import ContainerInfo, ContainerState, Need, PoolHint
+from appliance.pool.books import FOR_A_RUN, Books
 from appliance.pool.container import PooledContainer
-from appliance.pool.engine import Engine, EngineFacts
-from appliance.pool.policies.greedy_dual import GreedyDual
-from appliance.pool.policies.planner import missing, victims
-from appliance.pool.selection import best_local
+from appliance.pool.decisions import Decisions
+from appliance.pool.engine import LABEL_ID, Engine, EngineFacts
+from appliance.pool.link import EngineLink
+from appliance.pool.policies import ColdCosts, Idle, Planner, Quarantine, Retire, View
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 
 log = structlog.get_logger(__name__)
 
 TEND_S = 0.5
-"""How often the books are gone through when nothing happens."""
-MAX_RECONNECT_S = 30.0
+"""How often everything is gone through when nothing happens."""
+TEND_AT_MOST_EVERY_S = 0.05
+"""And how often when very much happens: each run changes the books three times."""
 CONNECT_WAIT_S = 10.0
 """How long a start waits for Podman; after that it goes on without."""
-FOR_A_RUN = "cold"
-"""Reservation of a container that is started for one waiting run."""
-
-
-class _Waiter:
-    """Somebody in the queue."""
-
-    def __init__(self, need: Need) -> None:
-        self.need = need
-        self.got: asyncio.Future[PooledContainer] = asyncio.get_running_loop().create_future()
+SWEEP_S = 30.0
+"""How often Podman is asked whether it has containers of ours that are not in the books."""
 
 
 class Keeper:
-    """The containers of one gateway. `starter` makes them; `refused` counts what is declined."""
+    """The containers of one gateway.
+
+    Args:
+        config: section `[pool]`.
+        gateway: this gateway's id.
+        images: all images of the catalogue.
+        make_starter: makes what makes containers; it is given what to call when one dies.
+        make_engine: makes the connection to Podman.
+        on_change: told the facts of all containers after something changed.
+        refused: counts what is declined.
+    """
 
     def __init__(
         self,
         config: PoolConfig,
         *,
         gateway: str,
+        images: Iterable[str],
         make_starter: Callable[[Callable[[PooledContainer], None]], Starter],
         make_engine: Callable[[], Engine],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         refused: Counter[str],
     ) -> None:
-        self.facts: EngineFacts | None = None
-        self.podman_problem = "not started"
-        self.costs = policies.ColdCosts(config.cold_ms)
+        self.costs = ColdCosts(config.cold_ms)
+        self.decisions = Decisions()
+        self.books = Books(config, begin=self._begin, on_change=on_change, refused=refused)
+        self.link = EngineLink(make_engine, reconnect_s=config.reconnect_s, on_connected=self._on_connected)
         self._config = config
         self._gateway = gateway
-        self._starter = make_starter(lambda container: self.retire(container, "it died"))
-        self._make_engine = make_engine
-        self._on_change = on_change
+        self._images = tuple(images)
         self._refused = refused
-        self._pooled: dict[str, PooledContainer] = {}
+        self._starter = make_starter(lambda container: self.retire(container, "it died"))
+        self._planner = Planner(config, self.costs, lambda image: self._starter.size(image).memory_mb)
+        self._quarantine = Quarantine(after=config.bad_starts, for_s=config.quarantine_s)
         self._starts: dict[str, asyncio.Task[SwiftbotError | None]] = {}
-        self._waiting: deque[_Waiter] = deque()
         self._background: set[asyncio.Task[None]] = set()
-        self._quarantine = policies.Quarantine(after=config.bad_starts, for_s=config.quarantine_s)
-        self._asked: dict[str, tuple[int, float]] = {}
-        """Containers of each image that somebody asked to have ready, and until when."""
-        self._evictor = GreedyDual()
-        self._engine: Engine | None = None
-        self._connecting: asyncio.Task[None] | None = None
-        self._pause_s = config.reconnect_s
-        self._try_at = 0.0
+        self._next_sweep = 0.0
+        self.draining = False
+        """Nothing new is begun here: no run, no hint, no warming."""
         self._adopted = False
         self._stopped = False
         self._wake = asyncio.Event()
-        self._watchers: set[asyncio.Event] = set()
         self._tender: asyncio.Task[None] | None = None
 
     # --- what is --------------------------------------------------------------------------------------------
@@ -91,16 +89,7 @@ class Keeper:
     @property
     def problem(self) -> str:
         """Why containers, or those of some image, cannot be started now; empty when they can."""
-        return self.podman_problem or "; ".join(self._quarantine.reasons(time.monotonic()))
-
-    @property
-    def queue(self) -> int:
-        """Runs that wait for a container."""
-        return len(self._waiting)
-
-    def containers(self) -> tuple[ContainerInfo, ...]:
-        """Return the facts of all containers held."""
-        return tuple(each.info for each in self._pooled.values())
+        return self.link.problem or "; ".join(self._quarantine.reasons(time.monotonic()))
 
     def check_startable(self, need: Need) -> None:
         """Raise when a cold start now would be in vain.
@@ -109,74 +98,59 @@ class Keeper:
             PoolError: Podman is away.
             RefusedError: the image does not start, or everything is busy and too many wait.
         """
-        if self.podman_problem:
-            raise PoolError(self.podman_problem, remedy="swiftbot doctor tells more")
-        reason = self._quarantine.reason(need.image, time.monotonic())
-        if reason:
-            self._refused["quarantined image"] += 1
-            raise RefusedError(reason, remedy="swiftbot images build, then swiftbot doctor")
-        if len(self._waiting) >= self._config.queue and self._room(need, commit=False) is None:
+        self._check_image(need.image)
+        if self.books.queue >= self._config.queue and self._room(self._size_mb(need), for_run=True) is None:
             self._refused["queue full"] += 1
             raise RefusedError(
-                f"all {len(self._pooled)} containers of {self._gateway} are busy and {len(self._waiting)} runs wait",
+                f"all {len(self.books)} containers of {self._gateway} are busy and {self.books.queue} runs wait",
                 remedy="wait, or raise pool.capacity",
             )
 
-    # --- what others ask --------------------------------------------------------------------------------------
-
-    def want(self, image: str, count: int, for_s: float) -> None:
-        """Have so many containers of an image ready for so long, as far as there is room."""
-        now = time.monotonic()
-        before, until = self._asked.get(image, (0, 0.0))
-        if until > now:
-            count, for_s = max(before, count), max(until - now, for_s)
-        self._asked[image] = (count, now + for_s)
-        self._wake.set()
+    def _check_image(self, image: str) -> None:
+        if self.link.problem:
+            raise PoolError(self.link.problem, remedy="swiftbot doctor tells more")
+        if reason := self._quarantine.reason(image, time.monotonic()):
+            self._refused["quarantined image"] += 1
+            raise RefusedError(reason, remedy="swiftbot images build, then swiftbot doctor")
 
     def why_no_start(self, image: str) -> str:
-        """Return why one more container of an image cannot be started now; empty when it can."""
-        if self.podman_problem:
-            return self.podman_problem
-        reason = self._quarantine.reason(image, time.monotonic())
-        if reason:
+        """Return why one more container of an image cannot be started ahead now; empty when it can."""
+        if reason := self.link.problem or self._quarantine.reason(image, time.monotonic()):
             return reason
         size_mb = self._starter.size(image).memory_mb
-        if self._free(size_mb, spare_floor=True, commit=False) is not None:
+        victims = self._room(size_mb, for_run=False)
+        if victims is not None and not any(self._image_of(each) == image for each in victims):
             return ""
-        held_mb = sum(each.info.memory_mb for each in self._pooled.values())
-        holders = Counter(f"{each.info.state} {each.info.image}" for each in self._pooled.values())
+        holders = Counter(f"{each.info.state} {each.info.image}" for each in self.books)
         return (
-            f"no room for one more {image} container ({size_mb} MB): {len(self._pooled)} of {self._config.capacity}"
-            f" places and {held_mb} of {self._config.memory_mb} MB are taken by "
+            f"no room for one more {image} container ({size_mb} MB): {len(self.books)} of {self._config.capacity}"
+            f" places and {self.books.memory_mb} of {self._config.memory_mb} MB are taken by "
             + ", ".join(f"{count} {what}" for what, count in sorted(holders.items()))
         )
 
+    # --- what others ask --------------------------------------------------------------------------------------
+
+    def hinted(self, hint: PoolHint) -> None:
+        """Note what will be needed here."""
+        self._planner.hinted(hint, time.monotonic())
+        self._wake.set()
+
+    def arrived(self, image: str) -> None:
+        """Note that a run begins here, or waits for a container."""
+        self._planner.arrived(image, time.monotonic())
+
+    def ended(self, image: str, held_s: float) -> None:
+        """Note that a run that had arrived is over, having had its container for so long (0: it had none)."""
+        self._planner.ended(image, held_s, time.monotonic())
+
     async def have(self, image: str, count: int) -> None:
         """Wait until so many containers of an image are ready, or no more can be started."""
-        changed = asyncio.Event()
-        self._watchers.add(changed)
-        try:
-            while self._count(image, ContainerState.READY) < count and (self._starts or not self.why_no_start(image)):
-                await changed.wait()
-                changed.clear()
-        finally:
-            self._watchers.discard(changed)
-
-    def why_kept(self, info: ContainerInfo) -> str:
-        """Return why a container cannot be given up now; empty when it can."""
-        match info.state:
-            case ContainerState.READY:
-                return ""
-            case ContainerState.BUSY:
-                return f"it runs {info.run}"
-            case ContainerState.RESERVED:
-                return "a run is about to begin in it"
-            case state:
-                return f"it is {state}"
-
-    def give_up(self, container_id: str, why: str) -> None:
-        """Retire a container that is idle."""
-        self.retire(self._pooled[container_id], why)
+        await self.books.until(
+            lambda: (
+                self.books.count(image, ContainerState.READY) >= count
+                or (not self._starts and bool(self.why_no_start(image)))
+            )
+        )
 
     def release_quarantine(self, image: str) -> str:
         """Start containers of an image again; returns why they were not, empty when they were."""
@@ -189,18 +163,16 @@ class Keeper:
 
     async def start(self) -> None:
         """Connect to Podman and adopt what is there; whatever is missing then is worked on in the background."""
-        self._connecting = asyncio.create_task(self._connect(), name="connect to Podman")
-        await asyncio.wait({self._connecting}, timeout=CONNECT_WAIT_S)
+        await self.link.start(CONNECT_WAIT_S)
         self._tender = asyncio.create_task(self._tend_forever(), name="tend the pool")
 
     async def stop(self, *, keep_containers: bool, patience_s: float) -> None:
         """Let go of everything; containers go on running, to be adopted, if they are to be kept."""
         self._stopped = True
-        for waiter in self._waiting:
-            waiter.got.cancel()
-        for task in (self._tender, self._connecting):
-            if task is not None:
-                task.cancel()
+        self.books.send_away()
+        if self._tender is not None:
+            self._tender.cancel()
+        self.link.cancel()
         # Starts are let come to their end: one cut off between two steps would leave a container nobody knows.
         until = time.monotonic() + patience_s
         while tasks := self._unfinished():
@@ -211,55 +183,84 @@ class Keeper:
                     task.cancel()
                 await asyncio.wait(tasks, timeout=1.0)
                 break
-        for container in self._pooled.values():
+        for container in self.books:
             container.close()
-        if not keep_containers and self._engine is not None:
+        engine = self.link.engine
+        if not keep_containers and engine is not None:
             try:
-                await asyncio.gather(*(self._starter.remove(each, self._engine) for each in self._pooled.values()))
-                await asyncio.gather(*(self._engine.remove(each) for each in await self._starter.own(self._engine)))
+                await asyncio.gather(*(self._starter.remove(each, engine) for each in self.books))
+                await asyncio.gather(*(engine.remove(each.id) for each in await self._starter.own(engine)))
             except SwiftbotError as error:
                 log.warning("containers were left", reason=str(error))
-        self._pooled.clear()
-        if self._engine is not None:
-            await asyncio.to_thread(self._engine.close)
-            self._engine = None
+        self.books.clear()
+        await self.link.close()
 
     def _unfinished(self) -> list[asyncio.Task[Any]]:
-        own = [task for task in (self._tender, self._connecting) if task is not None and not task.done()]
-        return [*own, *self._starts.values(), *self._background]
+        tender = [self._tender] if self._tender is not None and not self._tender.done() else []
+        return [*tender, *self.link.unfinished, *self._starts.values(), *self._background]
 
-    # --- handing out ------------------------------------------------------------------------------------------
+    def spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
+        """Run something in the background that `stop` waits for."""
+        task = asyncio.create_task(work, name=name)
+        self._background.add(task)
+        task.add_done_callback(self._background.discard)
 
-    def reserve(self, container_id: str) -> str:
-        """Hold a ready container for the lease and return the reservation's name."""
-        container = self._pooled[container_id]
-        self._hold(container, secrets.token_hex(4))
-        self._changed()
-        return container.reservation
+    # --- room -------------------------------------------------------------------------------------------------
 
-    def _hold(self, container: PooledContainer, reservation: str) -> None:
-        container.reservation = reservation
-        container.lease_until = time.monotonic() + self._config.lease_s
-        container.become(ContainerState.RESERVED)
+    def _size_mb(self, need: Need) -> int:
+        return self._starter.size(need.image, need).memory_mb
 
-    def claim(self, need: Need, *, container_id: str, reservation: str) -> PooledContainer | None:
-        """Return the container that is held under a reservation, or else another that is ready, or None."""
-        held = self._pooled.get(container_id)
-        if held is not None and reservation and held.reservation == reservation:
-            return held
-        return self._ready_for(need)
+    def _view(self) -> View:
+        """Return what there is, as the planner sees it."""
+        now = time.monotonic()
+        idle: list[Idle] = []
+        busy: Counter[str] = Counter()
+        starting: Counter[str] = Counter()
+        for container in self.books:
+            info = container.info
+            match info.state:
+                case ContainerState.READY:
+                    idle.append(
+                        Idle(
+                            id=info.id,
+                            image=info.image,
+                            memory_mb=info.memory_mb,
+                            runs=info.runs,
+                            cold_ms=info.cold_ms or self.costs.of(info.image),
+                            since=container.idle_since,
+                        )
+                    )
+                case ContainerState.STARTING:
+                    starting[info.image] += 1
+                case _:
+                    busy[info.image] += 1
+        return View(
+            idle=tuple(idle),
+            busy=busy,
+            starting=starting,
+            memory_mb=self.books.memory_mb,
+            containers=len(self.books),
+            budget_mb=self._config.memory_mb,
+            capacity=self._config.capacity,
+            blocked=frozenset(image for image in self._images if self._quarantine.reason(image, now)),
+        )
 
-    def _ready_for(self, need: Need) -> PooledContainer | None:
-        if self._config.mode == "cold":
-            return None
-        found = best_local(self.containers(), need, self._config.weights)
-        return self._pooled[found[0].id] if found is not None else None
+    def _room(self, memory_mb: int, *, for_run: bool) -> tuple[Retire, ...] | None:
+        """Return whom to give up for a container of this size; None when there is no room."""
+        return self._planner.room(self._view(), memory_mb, time.monotonic(), for_run=for_run)
 
-    def busy(self, container: PooledContainer, run_id: str) -> None:
-        """Note that a run has it."""
-        container.reservation = ""
-        container.become(ContainerState.BUSY, run=run_id)
-        self._changed()
+    def _image_of(self, retirement: Retire) -> str:
+        container = self.books.get(retirement.id)
+        return container.info.image if container is not None else ""
+
+    def _make_room(self, retirements: tuple[Retire, ...], view: View) -> None:
+        idle = {each.id: each for each in view.idle}
+        for each in retirements:
+            self._planner.evicted(idle[each.id], time.monotonic())
+            # Those who wait are served when the new one has its place, not in between.
+            self.give_up(each.id, each.why, serve=False)
+
+    # --- starting ---------------------------------------------------------------------------------------------
 
     async def acquire(self, need: Need) -> PooledContainer:
         """Start a container, or wait for one when there is no room. Its reservation tells a new one: FOR_A_RUN.
@@ -268,109 +269,37 @@ class Keeper:
             PoolError, PrerequisiteError, UnreachableError: none started, or none came free in time.
             RefusedError: too many wait already.
         """
-        container = self._begin_cold(need)
+        self.check_startable(need)
+        container = self._begin(need)
         if container is None:
-            container = await self._wait_in_queue(need)
+            container = await self.books.wait(need)
         if container.info.state is ContainerState.STARTING:
             try:
                 error = await asyncio.shield(self._starts[container.id])
             except asyncio.CancelledError:
-                container.reservation = ""  # nobody waits for it any more: it joins the ready ones
+                self.books.give_back(container)
                 raise
             if error is not None:
                 raise error
         return container
 
-    def _begin_cold(self, need: Need) -> PooledContainer | None:
+    def _begin(self, need: Need) -> PooledContainer | None:
         """Begin a start for one run; None when there is no room. Raises when a start would be in vain."""
-        self.check_startable(need)
-        if self._room(need, commit=True) is None:
+        view = self._view()
+        victims = self._planner.room(view, self._size_mb(need), time.monotonic(), for_run=True)
+        if victims is None:
             return None
-        container = self._start(need.image, need)
+        self._check_image(need.image)
+        self._make_room(victims, view)
+        container = self._start(need.image, need, "a run waits for it")
         container.reservation = FOR_A_RUN
         return container
 
-    async def _wait_in_queue(self, need: Need) -> PooledContainer:
-        waiter = _Waiter(need)
-        self._waiting.append(waiter)
-        try:
-            async with asyncio.timeout(self._config.queue_wait_s):
-                try:
-                    return await waiter.got
-                except asyncio.CancelledError:
-                    if waiter.got.done() and not waiter.got.cancelled() and waiter.got.exception() is None:
-                        self._give_back(waiter.got.result())  # it was handed over at the very moment
-                    raise
-        except TimeoutError as error:
-            self._refused["queue wait"] += 1
-            raise PoolError(
-                f"no container came free within {self._config.queue_wait_s:g} s", remedy="raise pool.capacity"
-            ) from error
-        finally:
-            self._waiting.remove(waiter)
-
-    def _give_back(self, container: PooledContainer) -> None:
-        container.reservation = ""
-        if container.info.state is not ContainerState.STARTING:
-            self.release(container)
-
-    def _serve_queue(self) -> None:
-        """Hand what is ready, or room for a new one, to those who wait, first come first served."""
-        for waiter in list(self._waiting):
-            if waiter.got.done():
-                continue
-            container = self._ready_for(waiter.need)
-            if container is not None:
-                self._hold(container, "queue")
-            elif self._room(waiter.need, commit=False) is not None:
-                try:
-                    container = self._begin_cold(waiter.need)
-                except SwiftbotError as error:
-                    waiter.got.set_exception(error)
-                    continue
-            if container is not None:
-                waiter.got.set_result(container)
-
-    def _room(self, need: Need, *, commit: bool) -> tuple[policies.Idle, ...] | None:
-        """Return whom to give up for a container of this need; None when there is no room. `commit` does it."""
-        return self._free(self._starter.size(need.image, need).memory_mb, spare_floor=False, commit=commit)
-
-    def _free(self, memory_mb: int, *, spare_floor: bool, commit: bool) -> tuple[policies.Idle, ...] | None:
-        now = time.monotonic()
-        held = sum(each.info.memory_mb for each in self._pooled.values())
-        idle = [
-            policies.Idle(
-                id=each.id,
-                image=each.info.image,
-                memory_mb=each.info.memory_mb,
-                runs=each.info.runs,
-                cold_ms=each.info.cold_ms or self.costs.of(each.info.image),
-                since=each.idle_since,
-            )
-            for each in self._pooled.values()
-            if each.info.state is ContainerState.READY
-        ]
-        chosen = victims(
-            idle,
-            self._evictor.worths(idle, now),
-            slots=len(self._pooled) + 1 - self._config.capacity,
-            memory_mb=held + memory_mb - self._config.memory_mb,
-            spare=self._wanted(now) if spare_floor else {},
-        )
-        if commit:
-            for each in chosen or ():
-                self._evictor.evicted(each, now)
-                # Those who wait are served when the new one has its place, not in between.
-                self.retire(self._pooled[each.id], "its place is needed", serve=False)
-        return chosen
-
-    # --- starting and ending ----------------------------------------------------------------------------------
-
-    def _start(self, image: str, need: Need | None) -> PooledContainer:
+    def _start(self, image: str, need: Need | None, why: str) -> PooledContainer:
         container = self._starter.new(image, need)
-        self._pooled[container.id] = container
+        self.decisions.note("start", image=image, container=container.id, why=why)
         self._starts[container.id] = asyncio.create_task(self._carry_start(container), name=f"start {container.id}")
-        self._changed()
+        self.books.add(container)
         return container
 
     async def _carry_start(self, container: PooledContainer) -> SwiftbotError | None:
@@ -378,93 +307,83 @@ class Keeper:
         image = container.info.image
         error: SwiftbotError | None = None
         try:
-            if self._engine is None or self.facts is None:
-                raise PoolError(self.podman_problem or "Podman is not connected")
-            await self._starter.start(container, self._engine, self.facts)
+            await self._starter.start(container, *self.link.there())
         except SwiftbotError as caught:
             error = caught
-            log.warning("container did not start", image=image, container=container.id, reason=str(error))
-            if isinstance(error, UnreachableError):
-                self._lost(error)
-            else:
-                self._quarantine.failed(image, str(error), time.monotonic())
         finally:
             del self._starts[container.id]
             if container.info.cold_ms is None:
-                self._pooled.pop(container.id, None)
-        if error is None and container.id not in self._pooled:
+                self.books.drop(container)
+        if error is None and self.books.get(container.id) is None:
             error = PoolError(f"container {container.id} died as soon as it was there")
-            self._quarantine.failed(image, str(error), time.monotonic())
         if error is not None:
-            self._serve_queue()
-            self._changed()
+            self._start_failed(container, error)
             return error
         self._quarantine.succeeded(image)
         cold_ms = container.info.cold_ms or 0.0
         self.costs.add(image, cold_ms)
         log.info("container ready", image=image, container=container.id, took_ms=round(cold_ms))
         container.next_probe = time.monotonic() + self._config.probe_s
-        if container.reservation != FOR_A_RUN:
-            if self._config.mode == "cold":
-                self.retire(container, "nobody waits for it any more")
-            else:
-                self.release(container)
+        if container.reservation == FOR_A_RUN:
+            self.books.hold(container, FOR_A_RUN)  # with a lease, should whoever waits go away at this very moment
+        else:
+            self.books.ready(container)
         return None
+
+    def _start_failed(self, container: PooledContainer, error: SwiftbotError) -> None:
+        image = container.info.image
+        self.decisions.note("fail", image=image, container=container.id, why=str(error))
+        if isinstance(error, UnreachableError):
+            self.link.lost(error)
+        else:
+            self._quarantine.failed(image, str(error), time.monotonic())
+        self.books.serve()
+        self._wake.set()
+
+    # --- after a run, and ending ------------------------------------------------------------------------------
+
+    def taken(self, container: PooledContainer, run_id: str) -> None:
+        """Note that a run has it."""
+        self.books.busy(container, run_id)
+        self._wake.set()
 
     def ran(self, container: PooledContainer) -> None:
         """Note that a run in it has ended well swept, and make it ready, or replace it when it has had its day."""
         container.count_run()
         grown_mb = container.rss_mb - container.first_rss_mb
-        if self._config.mode == "cold":
-            self.retire(container, "mode is cold")
-        elif container.info.runs >= self._config.max_runs:
+        if container.info.runs >= self._config.max_runs:
             self.retire(container, f"it has had {container.info.runs} runs")
         elif grown_mb > self._config.max_growth_mb:
             self.retire(container, f"its runner has grown by {grown_mb:.0f} MB")
         else:
-            self.release(container)
-
-    def release(self, container: PooledContainer) -> None:
-        """Make a container ready for the next."""
-        if self._pooled.get(container.id) is not container:
-            return
-        container.reservation = ""
-        container.idle_since = time.monotonic()
-        container.become(ContainerState.READY)
-        self._serve_queue()
-        self._changed()
+            self.books.ready(container)
+            self._wake.set()
 
     def retire(self, container: PooledContainer, reason: str, *, serve: bool = True) -> None:
         """Take a container out of the books at once and remove it in the background."""
-        if self._pooled.pop(container.id, None) is None:
+        if not self.books.drop(container):
             return
-        log.info("container retired", container=container.id, image=container.info.image, reason=reason)
+        self.decisions.note("retire", image=container.info.image, container=container.id, why=reason)
         container.become(ContainerState.DEAD)
         container.close()
         self.spawn(self._bury(container), f"remove {container.id}")
         if serve:
-            self._serve_queue()
-        self._changed()
+            self.books.serve()
+        self._wake.set()
+
+    def give_up(self, container_id: str, reason: str, *, serve: bool = True) -> None:
+        """Retire a container that nobody has."""
+        container = self.books.get(container_id)
+        if container is not None and container.info.state is ContainerState.READY:
+            self.retire(container, reason, serve=serve)
 
     async def _bury(self, container: PooledContainer) -> None:
         try:
-            await self._starter.remove(container, self._engine)
+            await self._starter.remove(container, self.link.engine)
         except UnreachableError as error:
-            self._lost(error)  # what is left is found by its label after reconnecting
+            self.link.lost(error)  # what is left is found by its label after reconnecting
         except SwiftbotError as error:
             log.warning("container was not removed", container=container.id, reason=str(error))
-
-    def spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        """Run something in the background that `stop` waits for."""
-        task = asyncio.create_task(work, name=name)
-        self._background.add(task)
-        task.add_done_callback(self._background.discard)
-
-    def _changed(self) -> None:
-        self._wake.set()
-        for watcher in self._watchers:
-            watcher.set()
-        self._on_change(self.containers())
 
     # --- tending ----------------------------------------------------------------------------------------------
 
@@ -474,57 +393,39 @@ class Keeper:
                 self._tend(time.monotonic())
             except Exception:  # supervision boundary: the pool is tended for as long as the gateway lives
                 log.exception("tending the pool broke")
-            self._wake.clear()
+            await asyncio.sleep(TEND_AT_MOST_EVERY_S)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(TEND_S):
                     await self._wake.wait()
+            self._wake.clear()
 
     def _tend(self, now: float) -> None:
-        if self.podman_problem and now >= self._try_at and (self._connecting is None or self._connecting.done()):
-            self._connecting = asyncio.create_task(self._connect(), name="connect to Podman")
-        for container in list(self._pooled.values()):
-            self._look_at(container, now)
-        self._serve_queue()
-        if not self._stopped and not self.podman_problem and self._config.mode != "cold":
-            self._prewarm(now)
+        self.link.tend(now)
+        self.books.expire(now)
+        for container in self.books:
+            if container.info.state is not ContainerState.STARTING and now >= container.next_probe:
+                container.next_probe = math.inf  # one at a time
+                self.spawn(self._probe(container), f"probe {container.id}")
+        self.books.serve()
+        if self._config.mode == "cold":
+            for container in self.books:
+                if container.info.state is ContainerState.READY:
+                    self.retire(container, "mode is cold: each run has a new one")
+        if self._stopped or self.link.problem:
+            return
+        if self._config.mode != "cold":
+            self._plan(now)
+        if now >= self._next_sweep:
+            self._next_sweep = now + SWEEP_S
+            self.spawn(self._sweep(), "look for stray containers")
 
-    def _look_at(self, container: PooledContainer, now: float) -> None:
-        info = container.info
-        if info.state is ContainerState.RESERVED and now >= container.lease_until:
-            self._refused["lease expired"] += 1
-            self.release(container)
-        elif (
-            info.state is ContainerState.READY
-            and now - container.idle_since > self._config.idle_s
-            and self._count(info.image) > self._wanted(now).get(info.image, 0)
-        ):
-            self.retire(container, "idle for long")
-        elif info.state is not ContainerState.STARTING and now >= container.next_probe:
-            container.next_probe = now + self._config.probe_s
-            self.spawn(self._probe(container), f"probe {container.id}")
-
-    def _count(self, image: str, *states: ContainerState) -> int:
-        states = states or (ContainerState.READY, ContainerState.STARTING)
-        return sum(each.info.image == image and each.info.state in states for each in self._pooled.values())
-
-    def _wanted(self, now: float) -> dict[str, int]:
-        """Return how many containers of each image are to be ready: the floor, and what was asked for."""
-        self._asked = {image: each for image, each in self._asked.items() if each[1] > now}
-        wanted = dict(self._config.floor)
-        for image, (count, _) in self._asked.items():
-            wanted[image] = max(count, wanted.get(image, 0))
-        return wanted
-
-    def _prewarm(self, now: float) -> None:
-        wanted = self._wanted(now)
-        coming = {image: self._count(image) for image in wanted}
-        for image in missing(wanted, coming):
-            if len(self._starts) >= self._config.starts_at_once:
-                return
-            if self._quarantine.reason(image, now):
-                continue
-            if self._free(self._starter.size(image).memory_mb, spare_floor=True, commit=True) is not None:
-                self._start(image, None)
+    def _plan(self, now: float) -> None:
+        """Carry out what the planner wants started and given up."""
+        starts, retirements = self._planner.tend(self._view(), now)
+        for each in retirements:
+            self.give_up(each.id, each.why, serve=False)
+        for each in starts:
+            self._start(each.image, None, each.why)
 
     async def _probe(self, container: PooledContainer) -> None:
         try:
@@ -534,51 +435,35 @@ class Keeper:
             container.missed_probes += 1
             if container.missed_probes >= self._config.probe_failures:
                 self.retire(container, f"does not answer: {error.message}")
+        container.next_probe = time.monotonic() + self._config.probe_s
 
-    # --- Podman -----------------------------------------------------------------------------------------------
-
-    def _lost(self, error: SwiftbotError) -> None:
-        if not self.podman_problem:
-            self.podman_problem = str(error)
-            self._pause_s = self._config.reconnect_s
-            self._try_at = time.monotonic() + self._pause_s
-            log.warning("Podman is away", reason=str(error))
-
-    async def _connect(self) -> None:
-        """Reach Podman; the first time adopt what is there, later remove what was left over."""
-        try:
-            self._engine = self._engine or self._make_engine()
-            self.facts = await self._engine.facts()
-            if self._adopted:
-                await self._remove_strays(self._engine)
-            else:
-                await self._adopt(self._engine)
-        except SwiftbotError as error:
-            if self.podman_problem != str(error):
-                log.warning("Podman cannot be used", reason=str(error))
-            self.podman_problem = str(error)
-            self._try_at = time.monotonic() + self._pause_s
-            self._pause_s = min(2 * self._pause_s, MAX_RECONNECT_S)
+    async def _sweep(self) -> None:
+        """Remove containers of ours that Podman has and the books have not."""
+        engine = self.link.engine
+        if engine is None:
             return
-        self.podman_problem = ""
-        self._pause_s = self._config.reconnect_s
-        self._changed()
+        try:
+            for found in await self._starter.own(engine):
+                if self.books.get(found.labels.get(LABEL_ID, "")) is None:
+                    log.info("stray container removed", container=found.name)
+                    await engine.remove(found.id)
+        except UnreachableError as error:
+            self.link.lost(error)
+        except SwiftbotError as error:
+            log.warning("stray containers were not removed", reason=str(error))
 
-    async def _adopt(self, engine: Engine) -> None:
-        for container in await self._starter.adopt(engine):
-            self._pooled[container.id] = container
-            container.next_probe = time.monotonic() + self._config.probe_s
-            log.info("container adopted", container=container.id, image=container.info.image)
-            if self._config.mode == "cold":
-                self.retire(container, "mode is cold")
-            else:
-                self.release(container)
-        self._adopted = True
-        if self.facts is not None and not self.facts.limits_enforced:
-            log.warning("limits of containers are not enforced here", cgroup=self.facts.cgroup_version)
+    # --- Podman is there --------------------------------------------------------------------------------------
 
-    async def _remove_strays(self, engine: Engine) -> None:
-        """Remove what could not be removed while Podman was away."""
-        for found in await self._starter.own(engine):
-            if found not in {each.engine_id for each in self._pooled.values()} and not self._starts:
-                await engine.remove(found)
+    async def _on_connected(self, engine: Engine, facts: EngineFacts) -> None:
+        """Adopt what is there the first time; later look for what was left over."""
+        self._next_sweep = 0.0
+        if not self._adopted:
+            for container in await self._starter.adopt(engine):
+                self.books.add(container)
+                container.next_probe = time.monotonic() + self._config.probe_s
+                self.decisions.note("adopt", image=container.info.image, container=container.id, why="it runs")
+                self.books.ready(container)
+            self._adopted = True
+            if not facts.limits_enforced:
+                log.warning("limits of containers are not enforced here", cgroup=facts.cgroup_version)
+        self._wake.set()

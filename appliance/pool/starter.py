@@ -151,9 +151,9 @@ class Starter:
             await engine.remove(container.engine_id)
         await asyncio.to_thread(shutil.rmtree, container.folder, ignore_errors=True)
 
-    async def own(self, engine: Engine) -> list[str]:
-        """Return Podman's ids of this gateway's containers."""
-        return [each.id for each in await engine.containers(self._labels)]
+    async def own(self, engine: Engine) -> list[Found]:
+        """Return what Podman has of this gateway's containers, running or not."""
+        return await engine.containers(self._labels)
 
     async def adopt(self, engine: Engine) -> list[PooledContainer]:
         """Take over this gateway's running containers that are as they would be made now; remove the others.

@@ -1,0 +1,246 @@
+"""The books of the pool: which containers there are, who has which, and who waits for one.
+
+It exists apart from the keeper because these few rules must hold at every step between two awaits: a container has
+one holder, a hold that is not used ends, and those who wait are served in their order. Nothing here starts or ends
+a container, and nothing here is awaited but one's turn.
+"""
+
+import asyncio
+import secrets
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+
+from appliance.errors import PoolError, SwiftbotError
+from appliance.model import ContainerInfo, ContainerState, Need
+from appliance.pool.container import PooledContainer
+from appliance.pool.selection import best_local
+from appliance.pool.settings import PoolConfig
+
+FOR_A_RUN = "cold"
+"""Reservation of a container that is started for one waiting run."""
+IN_TURN = "queue"
+"""Reservation of a container that is handed to somebody in the queue."""
+
+
+class _Waiter:
+    """Somebody in the queue."""
+
+    def __init__(self, need: Need) -> None:
+        self.need = need
+        self.got: asyncio.Future[PooledContainer] = asyncio.get_running_loop().create_future()
+
+
+class Books:
+    """Who has which container.
+
+    Args:
+        config: lease, queue, weights, mode.
+        begin: begins a start for a need and returns its container, None without room; raises when it would be in vain.
+        on_change: told the facts of all containers after something changed, once per turn of the event loop.
+        refused: counts what is declined.
+    """
+
+    def __init__(
+        self,
+        config: PoolConfig,
+        *,
+        begin: Callable[[Need], PooledContainer | None],
+        on_change: Callable[[tuple[ContainerInfo, ...]], None],
+        refused: Counter[str],
+    ) -> None:
+        self._config = config
+        self._begin = begin
+        self._on_change = on_change
+        self._refused = refused
+        self._held: dict[str, PooledContainer] = {}
+        self._facts: tuple[ContainerInfo, ...] | None = ()
+        self._waiting: deque[_Waiter] = deque()
+        self._watchers: set[asyncio.Event] = set()
+        self._telling = False
+
+    # --- what is --------------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[PooledContainer]:
+        """Go through all containers held; the caller may change the books meanwhile."""
+        return iter(tuple(self._held.values()))
+
+    def __len__(self) -> int:
+        """Return how many containers are held, whatever their state."""
+        return len(self._held)
+
+    def get(self, container_id: str) -> PooledContainer | None:
+        """Return a container by its id."""
+        return self._held.get(container_id)
+
+    @property
+    def queue(self) -> int:
+        """Runs that wait for a container."""
+        return len(self._waiting)
+
+    @property
+    def memory_mb(self) -> int:
+        """What all containers together are allowed."""
+        return sum(each.info.memory_mb for each in self._held.values())
+
+    def facts(self) -> tuple[ContainerInfo, ...]:
+        """Return the facts of all containers held."""
+        if self._facts is None:
+            self._facts = tuple(each.info for each in self._held.values())
+        return self._facts
+
+    def count(self, image: str, *states: ContainerState) -> int:
+        """Return how many containers of an image are in one of these states."""
+        return sum(each.image == image and each.state in states for each in self.facts())
+
+    # --- coming and going -------------------------------------------------------------------------------------
+
+    def add(self, container: PooledContainer) -> None:
+        """Take a container into the books."""
+        self._held[container.id] = container
+        self.changed()
+
+    def drop(self, container: PooledContainer) -> bool:
+        """Take a container out of the books; False when it was not in them."""
+        if self._held.get(container.id) is not container:
+            return False
+        del self._held[container.id]
+        self.changed()
+        return True
+
+    def send_away(self) -> None:
+        """Let nobody wait any more."""
+        for waiter in self._waiting:
+            waiter.got.cancel()
+
+    def clear(self) -> None:
+        """Forget all containers, without a word to anybody: they are somebody else's now."""
+        self._held.clear()
+        self._facts = None
+
+    def changed(self) -> None:
+        """Note that facts have changed; all changes of one turn of the event loop are told at once."""
+        self._facts = None
+        if not self._telling:
+            self._telling = True
+            asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._telling = False
+        for watcher in self._watchers:
+            watcher.set()
+        self._on_change(self.facts())
+
+    async def until(self, true: Callable[[], bool]) -> None:
+        """Wait until something holds of the books."""
+        changed = asyncio.Event()
+        self._watchers.add(changed)
+        try:
+            while not true():
+                await changed.wait()
+                changed.clear()
+        finally:
+            self._watchers.discard(changed)
+
+    # --- handing out ------------------------------------------------------------------------------------------
+
+    def reserve(self, container_id: str) -> str:
+        """Hold a ready container for the lease and return the reservation's name."""
+        container = self._held[container_id]
+        self.hold(container, secrets.token_hex(4))
+        return container.reservation
+
+    def hold(self, container: PooledContainer, reservation: str) -> None:
+        """Hold a container for the lease under this name."""
+        container.reservation = reservation
+        container.lease_until = time.monotonic() + self._config.lease_s
+        container.become(ContainerState.RESERVED)
+        self.changed()
+
+    def give_back(self, container: PooledContainer) -> None:
+        """Let go of a container that was held or started for a run which does not want it any more."""
+        container.reservation = ""
+        if container.info.state is not ContainerState.STARTING:
+            self.ready(container)
+
+    def claim(self, need: Need, *, container_id: str, reservation: str) -> PooledContainer | None:
+        """Return the container that is held under a reservation, or else another that is ready, or None."""
+        held = self._held.get(container_id)
+        if held is not None and reservation and held.reservation == reservation:
+            return held
+        return self._ready_for(need)
+
+    def _ready_for(self, need: Need) -> PooledContainer | None:
+        if self._config.mode == "cold":
+            return None
+        found = best_local(self.facts(), need, self._config.weights)
+        return self._held[found[0].id] if found is not None else None
+
+    def busy(self, container: PooledContainer, run_id: str) -> None:
+        """Note that a run has it."""
+        container.reservation = ""
+        container.become(ContainerState.BUSY, run=run_id)
+        self.changed()
+
+    def ready(self, container: PooledContainer) -> None:
+        """Make a container ready for the next: whoever waits first, or else anybody."""
+        if self._held.get(container.id) is not container:
+            return
+        container.reservation = ""
+        container.idle_since = time.monotonic()
+        container.become(ContainerState.READY)
+        self.changed()
+        self.serve()
+
+    def expire(self, now: float) -> None:
+        """Free the containers whose reservation was not used in time."""
+        for container in self:
+            if container.info.state is ContainerState.RESERVED and now >= container.lease_until:
+                self._refused["lease expired"] += 1
+                self.ready(container)
+
+    # --- the queue --------------------------------------------------------------------------------------------
+
+    async def wait(self, need: Need) -> PooledContainer:
+        """Wait in the queue for a container, which may be one that is only starting.
+
+        Raises:
+            PoolError: none came free in time.
+            SwiftbotError: the start that was begun for it would be in vain.
+        """
+        waiter = _Waiter(need)
+        self._waiting.append(waiter)
+        try:
+            async with asyncio.timeout(self._config.queue_wait_s):
+                try:
+                    return await waiter.got
+                except asyncio.CancelledError:
+                    if waiter.got.done() and not waiter.got.cancelled() and waiter.got.exception() is None:
+                        self.give_back(waiter.got.result())  # it was handed over at the very moment
+                    raise
+        except TimeoutError as error:
+            self._refused["queue wait"] += 1
+            raise PoolError(
+                f"no container came free within {self._config.queue_wait_s:g} s", remedy="raise pool.capacity"
+            ) from error
+        finally:
+            self._waiting.remove(waiter)
+
+    def serve(self) -> None:
+        """Hand what is ready, or a start that there is room for, to those who wait, first come first served."""
+        if not self._waiting:
+            return
+        for waiter in tuple(self._waiting):
+            if waiter.got.done():
+                continue
+            container = self._ready_for(waiter.need)
+            if container is not None:
+                self.hold(container, IN_TURN)
+            else:
+                try:
+                    container = self._begin(waiter.need)
+                except SwiftbotError as error:
+                    waiter.got.set_exception(error)
+                    continue
+            if container is not None:
+                waiter.got.set_result(container)

@@ -1,0 +1,215 @@
+"""The runs in progress in this gateway's containers: each gets a container, is sent to it, and ends with one event.
+
+It exists apart from the door (`pool.py`), which chooses and refuses, and from the keeper, which knows containers and
+no runs: here a run that loses its container, is cancelled or does not end is brought to its end all the same.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from appliance.errors import CancelledByOperatorError, PoolError, RefusedError, SwiftbotError, UnreachableError
+from appliance.model import Failure, Phase, RunEvent, RunEventKind, RunRequest
+from appliance.pool.books import FOR_A_RUN, IN_TURN
+from appliance.pool.container import Connection, PooledContainer
+from appliance.pool.conversation import Call, Conversation, order
+from appliance.pool.keeper import Keeper
+from appliance.pool.selection import Decision
+from appliance.pool.settings import PoolConfig
+
+BACKSTOP_S = 3.0
+"""How much longer than the runner itself the pool waits for a run to end, before it ends the container."""
+TRIES = 3
+"""Containers that may be found dead at the moment a run is sent to them, before the run is given back."""
+
+
+class _Run:
+    """A run in progress here."""
+
+    def __init__(self) -> None:
+        self.cancelled = False
+        self.acquiring: asyncio.Task[PooledContainer] | None = None
+        self.container: PooledContainer | None = None
+        self.patience: asyncio.Timeout | None = None
+        self.began = 0.0
+
+
+class Runs:
+    """Carries runs out in the keeper's containers. `site` is the map that handlers get."""
+
+    def __init__(
+        self,
+        config: PoolConfig,
+        keeper: Keeper,
+        *,
+        gateway: str,
+        site: dict[str, Any],
+        on_call: Callable[[Call], Awaitable[dict[str, Any]]],
+        refused: Counter[str],
+    ) -> None:
+        self._config = config
+        self._keeper = keeper
+        self._gateway = gateway
+        self._site = site
+        self._on_call = on_call
+        self._refused = refused
+        self._runs: dict[str, _Run] = {}
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    @property
+    def patience_s(self) -> float:
+        """How long a run that was told to end may take to."""
+        return self._config.cancel_grace_s + 2 * BACKSTOP_S
+
+    async def run(self, request: RunRequest, decision: Decision, on_event: Callable[[RunEvent], None]) -> RunEvent:
+        """Carry out one attempt to its end; see `Pool.run`."""
+        entered_ns = time.monotonic_ns()
+        if request.run_id in self._runs:
+            raise RefusedError(f"run {request.run_id} is in progress here")
+        run = self._runs[request.run_id] = _Run()
+        self._idle.clear()
+        self._keeper.arrived(request.need.image)
+        try:
+            container, connection, phase = await self._place(request, decision, run)
+            conversation = Conversation(
+                connection,
+                request,
+                gateway=self._gateway,
+                container=container.id,
+                phase=phase,
+                entered_ns=entered_ns,
+                on_event=on_event,
+                on_call=self._on_call,
+                refused=self._refused,
+            )
+            return await self._listen(request, run, container, connection, conversation)
+        except CancelledByOperatorError as error:
+            return RunEvent(
+                task=request.task,
+                subtask=request.subtask,
+                attempt=request.attempt,
+                kind=RunEventKind.FAILED,
+                gateway=self._gateway,
+                failure=Failure(code=error.code, message=error.message),
+            )
+        finally:
+            del self._runs[request.run_id]
+            if not self._runs:
+                self._idle.set()
+            held_s = time.monotonic() - run.began if run.container is not None else 0.0
+            self._keeper.ended(request.need.image, held_s)
+
+    async def _place(
+        self, request: RunRequest, decision: Decision, run: _Run
+    ) -> tuple[PooledContainer, Connection, Phase]:
+        """Get a container and send the run to it; one that turns out to be dead is replaced by another."""
+        keeper = self._keeper
+        for _ in range(TRIES):
+            container = keeper.books.claim(
+                request.need, container_id=decision.container or "", reservation=decision.reservation
+            )
+            if container is None:
+                container = await self._acquire(request, run)
+                if container.reservation not in (FOR_A_RUN, IN_TURN):
+                    continue  # its lease ran out before this was told: the gateway stood still
+            phase = Phase.COLD if container.reservation == FOR_A_RUN else Phase.LOCAL_WARM
+            run.container = container
+            run.began = time.monotonic()
+            keeper.taken(container, request.run_id)
+            try:
+                return container, await container.begin(order(request, self._site)), phase
+            except UnreachableError:
+                keeper.retire(container, "it was found dead")  # nothing has run
+            except SwiftbotError:
+                keeper.books.ready(container)
+                raise
+            except asyncio.CancelledError:
+                keeper.retire(container, "its run was given up while it was sent")
+                raise
+        raise PoolError(f"{TRIES} containers in a row were found dead", remedy="see the gateway's log")
+
+    async def _acquire(self, request: RunRequest, run: _Run) -> PooledContainer:
+        run.acquiring = asyncio.create_task(self._keeper.acquire(request.need), name=f"get {request.run_id}")
+        try:
+            return await run.acquiring
+        except asyncio.CancelledError:
+            acquiring = run.acquiring
+            if acquiring.done() and not acquiring.cancelled() and acquiring.exception() is None:
+                self._keeper.books.give_back(acquiring.result())  # it came at the very moment
+            acquiring.cancel()
+            if not run.cancelled:
+                raise
+            raise CancelledByOperatorError(f"{request.run_id} was cancelled before it began") from None
+
+    async def _listen(
+        self,
+        request: RunRequest,
+        run: _Run,
+        container: PooledContainer,
+        connection: Connection,
+        conversation: Conversation,
+    ) -> RunEvent:
+        ended = False
+        try:
+            if run.cancelled:
+                await self.cancel(request.run_id)
+            limit_s = request.deadline_s + self._config.cancel_grace_s + BACKSTOP_S
+            async with asyncio.timeout(limit_s) as run.patience:
+                final = await conversation.listen()
+                ended = not conversation.broken
+                return final
+        except TimeoutError:
+            code = "cancelled" if run.cancelled else "deadline"
+            return conversation.failed(
+                code, "the run did not end when told to; its container was ended", retryable=not run.cancelled
+            )
+        finally:
+            if ended:
+                self._keeper.spawn(self._wind_up(container, connection, conversation), f"wind up {container.id}")
+            else:
+                connection.close()
+                self._keeper.retire(container, "its run did not end as it should")
+
+    async def _wind_up(self, container: PooledContainer, connection: Connection, conversation: Conversation) -> None:
+        """After a run: wait until the runner has swept up, then give the container to the next."""
+        try:
+            async with asyncio.timeout(self._config.cancel_grace_s + BACKSTOP_S):
+                await conversation.gone()
+            await container.refill()
+        except (TimeoutError, SwiftbotError) as error:
+            self._keeper.retire(container, f"did not come back from its run: {error}")
+        else:
+            self._keeper.ran(container)
+        finally:
+            connection.close()
+
+    async def cancel(self, run_id: str) -> bool:
+        """Ask a run to end; its last event follows from `run`. False when there is none of that id."""
+        run = self._runs.get(run_id)
+        if run is None:
+            return False
+        run.cancelled = True
+        if run.container is None:
+            if run.acquiring is not None:
+                run.acquiring.cancel()
+            return True
+        grace_s = self._config.cancel_grace_s
+        with contextlib.suppress(SwiftbotError):  # dead, or deaf: the backstop ends it
+            await run.container.cancel(run_id, reason="cancelled", grace_s=grace_s)
+        if run.patience is not None and not run.patience.expired():
+            with contextlib.suppress(RuntimeError):  # it has ended meanwhile
+                run.patience.reschedule(asyncio.get_running_loop().time() + grace_s + BACKSTOP_S)
+        return True
+
+    async def drain(self, deadline_s: float) -> None:
+        """Wait for the runs in progress; what is left after `deadline_s` is cancelled."""
+        for wait_s in (deadline_s, self.patience_s):
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait_s):
+                    await self._idle.wait()
+            for run_id in list(self._runs):
+                await self.cancel(run_id)
