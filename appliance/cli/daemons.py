@@ -3,10 +3,11 @@
 import asyncio
 import signal
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import uvloop
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from appliance import logs, service
 from appliance.cli.common import DAEMONS, HERE, Where
@@ -83,11 +84,20 @@ def _until_signalled() -> asyncio.Event:
 
 
 @sim_app.command
-def mavlink(*, to: str, system: int = 1, site: str = "warehouse", rate: float = 1.0, start: str = "home") -> int:
-    """Simulate a MAVLink copter that sends to a gateway's UDP port.
+def mavlink(
+    *,
+    to: str,
+    listen: Annotated[bool, Parameter(negative="")] = False,
+    system: int = 1,
+    site: str = "warehouse",
+    rate: float = 1.0,
+    start: str = "home",
+) -> int:
+    """Simulate a MAVLink copter that sends to a gateway, or waits for one.
 
     Args:
-        to: Where the gateway listens, udp://host:port.
+        to: Where the gateway listens, udp://host:port or tcp://host:port.
+        listen: Listen there (tcp), as SITL does, and let the gateway connect.
         system: MAVLink system id, 1 to 255.
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
@@ -97,7 +107,7 @@ def mavlink(*, to: str, system: int = 1, site: str = "warehouse", rate: float = 
     from appliance.skills.sites import load_site
 
     logs.configure(style="text")
-    settings = VehicleSettings(to=to, system=system, site=load_site(site), rate=rate, start=start)
+    settings = VehicleSettings(to=to, listen=listen, system=system, site=load_site(site), rate=rate, start=start)
 
     async def go() -> None:
         await run_vehicle(settings, stop=_until_signalled())

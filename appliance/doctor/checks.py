@@ -188,8 +188,9 @@ def check_ports(machine: Machine, config: GatewayConfig) -> Iterator[Check]:
         if parts.hostname and parts.port and protocol in ("tcp", "tls", "ws", "udp", "quic"):
             wanted.append((endpoint, parts.hostname, parts.port, protocol in ("udp", "quic")))
     for link in config.robots.mavlink:
-        host, port = link.address()
-        wanted.append((link.listen, host, port, True))
+        remote = link.remote
+        if remote.listens:
+            wanted.append((str(remote), remote.host, remote.port, remote.scheme == "udp"))
     for name, host, port, udp in wanted:
         problem = machine.bind_problem(host, port, udp=udp)
         holder = machine.listener(port, udp=udp) if problem else ""

@@ -1,9 +1,11 @@
 """What may be set about robots: where MAVLink vehicles are listened for, what they are called, how long to wait.
 
-A gateway listens on UDP as ground stations do, and vehicles (or SITL's `--out`, or mavlink-router) send to it.
+A gateway listens on UDP or TCP as ground stations do, and vehicles (or SITL's `--out`, or mavlink-router) send to it;
+or it connects to what listens itself.
 Every figure that decides how long something is waited for is here and nowhere else.
 """
 
+from typing import Literal
 from urllib.parse import urlsplit
 
 from msgspec import Struct, field
@@ -14,18 +16,42 @@ from appliance.plane.keys import check_name
 MAX_SYSTEM = 255
 
 
-class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One UDP port on which vehicles are heard. `names` maps MAVLink system ids (as text) to robot names."""
+DEFAULT_LISTEN = "udp://127.0.0.1:14550"
+"""14550 is where ground stations listen; loopback, since MAVLink frames are not authenticated."""
 
-    listen: str = "udp://127.0.0.1:14550"
-    """14550 is where ground stations listen; loopback, since MAVLink frames are not authenticated."""
+
+class Remote(Struct, frozen=True):
+    """An address of MAVLink: listen there, or connect to it."""
+
+    scheme: Literal["udp", "tcp"]
+    host: str
+    port: int
+    listens: bool
+
+    def __str__(self) -> str:
+        return f"{self.scheme}://{self.host}:{self.port}"
+
+
+class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One link on which vehicles are heard. `names` maps MAVLink system ids (as text) to robot names."""
+
+    listen: str = ""
+    """`udp://host:port` or `tcp://host:port` to listen on. With neither `listen` nor `connect`: udp://127.0.0.1:14550."""
+    connect: str = ""
+    """The same to connect to, again and again while nobody is there: a vehicle, SITL or a router that listens."""
     names: dict[str, str] = field(default_factory=dict[str, str])
     prefix: str = "drone_"
     """Name of a vehicle not in `names`: prefix and system id. Empty: such vehicles are refused."""
 
-    def address(self) -> tuple[str, int]:
-        """Return host and port; ConfigError when `listen` is not `udp://host:port`."""
-        return udp_address(self.listen)
+    @property
+    def remote(self) -> Remote:
+        """Where the link is; ConfigError when it is not understood, or to be both listened on and connected to."""
+        if self.listen and self.connect:
+            raise ConfigError(
+                f"robots.mavlink: a link both listens on {self.listen} and connects to {self.connect}",
+                remedy="write two links",
+            )
+        return read_remote(self.connect or self.listen or DEFAULT_LISTEN, listens=not self.connect)
 
     def name_of(self, system: int) -> str | None:
         """Return the robot name of a system id, None when such a vehicle is not accepted."""
@@ -36,7 +62,7 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def check(self) -> None:
         """Raise ConfigError for an address, system id or name that cannot be."""
-        self.address()
+        _ = self.remote
         for system, name in self.names.items():
             if not system.isdecimal() or not 1 <= int(system) <= MAX_SYSTEM:
                 raise ConfigError(
@@ -78,26 +104,28 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def check(self) -> None:
         """Raise ConfigError for values that cannot work together."""
-        addresses: set[tuple[str, int]] = set()
+        remotes: set[Remote] = set()
         for link in self.mavlink:
             link.check()
-            if link.address() in addresses:
-                raise ConfigError(f"robots.mavlink: {link.listen} is given twice", remedy="one link per UDP port")
-            addresses.add(link.address())
+            if link.remote in remotes:
+                raise ConfigError(f"robots.mavlink: {link.remote} is given twice", remedy="one link per address")
+            remotes.add(link.remote)
         if not 1 <= self.system_id <= MAX_SYSTEM:
             raise ConfigError(f"robots.system_id {self.system_id} is not a MAVLink system id", remedy="use 1 to 255")
 
 
-def udp_address(url: str) -> tuple[str, int]:
-    """Split `udp://host:port`; ConfigError with the remedy for anything else."""
+def read_remote(url: str, *, listens: bool) -> Remote:
+    """Split `udp://host:port` or `tcp://host:port`; ConfigError with the remedy for anything else."""
     parts = urlsplit(url)
     try:
         port = parts.port
     except ValueError:
         port = None
-    if parts.scheme != "udp" or not parts.hostname or port is None or parts.path not in ("", "/"):
-        raise ConfigError(f"MAVLink address {url!r} is not understood", remedy="write udp://host:port")
-    return parts.hostname, port
+    if parts.scheme not in ("udp", "tcp") or not parts.hostname or port is None or parts.path not in ("", "/"):
+        raise ConfigError(
+            f"MAVLink address {url!r} is not understood", remedy="write udp://host:port or tcp://host:port"
+        )
+    return Remote("udp" if parts.scheme == "udp" else "tcp", parts.hostname, port, listens)
 
 
 def _check_robot_name(name: str) -> None:

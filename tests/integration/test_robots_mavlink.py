@@ -54,7 +54,8 @@ class Yard:
 
     async def vehicle(self, **settings: Any) -> asyncio.subprocess.Process:
         """Start a vehicle and wait until the roster has it online."""
-        order = VehicleSettings(to=f"udp://127.0.0.1:{self.port}", site=SITE, **({"rate": 8.0} | settings))
+        usual = {"to": f"udp://127.0.0.1:{self.port}", "site": SITE, "rate": 8.0}
+        order = VehicleSettings(**(usual | settings))
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-c", _PROCESS, msgspec.json.encode(order).decode()
         )
@@ -94,12 +95,12 @@ async def open_yard(free_port: int, free_udp_port: int, tmp_path: Path) -> Async
     async with contextlib.AsyncExitStack() as stack:
         endpoint = f"tcp/127.0.0.1:{free_port}"
 
-        async def start(**changes: Any) -> Yard:
+        async def start(*, link: MavlinkLink | None = None, **changes: Any) -> Yard:
             session = await Session.open(PlaneConfig(listen=(endpoint,)), "yard")
             stack.push_async_callback(session.close)
             store = await Store.open(tmp_path / "store.sqlite")
             stack.push_async_callback(store.close)
-            link = MavlinkLink(listen=f"udp://127.0.0.1:{free_udp_port}", prefix="drone_")
+            link = link or MavlinkLink(listen=f"udp://127.0.0.1:{free_udp_port}", prefix="drone_")
             config = RobotsConfig(mavlink=(link,), **changes)
             hub = RobotHub(config, session=session, store=store, gateway="gw-1", site=SITE)
             await hub.start()
@@ -141,6 +142,18 @@ async def test_a_flight(open_yard: Open) -> None:
         frames = [each for data in yard.frames[direction] for each in Codec(9, 9).read(data)]
         assert frames
         assert {each.system for each in frames} == {sender}  # pyright: ignore[reportAttributeAccessIssue]
+
+
+async def test_a_vehicle_that_listens(open_yard: Open, free_ports: Callable[[int], list[int]]) -> None:
+    """A gateway connects to a vehicle that listens on TCP, as SITL does; the vehicle may start later, and again."""
+    url = f"tcp://127.0.0.1:{free_ports(1)[0]}"
+    yard = await open_yard(link=MavlinkLink(connect=url, prefix="drone_"), heartbeat_lost_s=1.5)
+    process = await yard.vehicle(to=url, listen=True)
+    assert (await yard.done("takeoff", altitude_m=6.0))["altitude_m"] == pytest.approx(6.0, abs=0.6)
+    process.kill()
+    await until(lambda: not yard.infos[-1].online)
+    await yard.vehicle(to=url, listen=True)
+    assert (await yard.done("state"))["armed"] is False
 
 
 async def test_goto_from_the_ground_and_home_again(open_yard: Open) -> None:

@@ -6,7 +6,7 @@ pymavlink's stream parser is not used: it resynchronises across datagrams and hi
 must count each damaged frame and keep the raw bytes of each good one. Its decoder and encoder are.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Any
 
 from msgspec import Struct
@@ -53,11 +53,18 @@ class Codec:
         self._mav.seq = (self._mav.seq + 1) % 256
         return raw
 
-    def read(self, data: bytes) -> Iterator[Frame | Damage]:
-        """Yield what a datagram (or a piece of a log) holds, in order; never raises, consumes every byte.
+    def read(self, data: bytes, *, more: bool = False) -> Generator[Frame | Damage, None, int]:
+        """Yield what a datagram (or a piece of a log or stream) holds, in order; never raises.
 
         After a damaged frame the search goes on at the first good frame that begins within it (its length may be
         what was damaged), else behind it, so that one flipped byte costs one frame.
+
+        Args:
+            data: the bytes.
+            more: more will follow, so that a frame that is not whole waits instead of being damage.
+
+        Returns:
+            How many bytes were used: all of them unless more will follow.
         """
         at = 0
         while at < len(data):
@@ -68,27 +75,29 @@ class Codec:
                 continue
             length = frame_length(data, at)
             if length is None or at + length > len(data):
+                if more:
+                    return at
                 following = _next_marker(data, at + 1)
                 yield Damage("truncated", following - at)
                 at = following
                 continue
             result = self._decode(data[at : at + length])
             if isinstance(result, Damage):
-                length = self._resume(data, at, length) - at
+                length = self._resume(data, at, length, more=more) - at
                 result = Damage(result.kind, length)
             yield result
             at += length
+        return at
 
-    def _resume(self, data: bytes, at: int, length: int) -> int:
+    def _resume(self, data: bytes, at: int, length: int, *, more: bool) -> int:
         """Return where to go on after a damaged frame of that announced length."""
         inner = _next_marker(data, at + 1)
         while inner < at + length:
             size = frame_length(data, inner)
-            if (
-                size is not None
-                and inner + size <= len(data)
-                and isinstance(self._decode(data[inner : inner + size]), Frame)
-            ):
+            if size is None or inner + size > len(data):
+                if more:
+                    return inner  # may become a frame
+            elif isinstance(self._decode(data[inner : inner + size]), Frame):
                 return inner
             inner = _next_marker(data, inner + 1)
         behind = at + length
@@ -115,6 +124,25 @@ class Codec:
             message=message,
             raw=raw,
         )
+
+
+class Stream:
+    """Frames out of a stream of bytes (TCP, serial), in which a frame may come in pieces."""
+
+    def __init__(self, codec: Codec) -> None:
+        self._codec = codec
+        self._rest = b""
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that has begun: at most one frame's."""
+        return len(self._rest)
+
+    def feed(self, data: bytes) -> Iterator[Frame | Damage]:
+        """Yield what is whole now; never raises. What may still become a frame waits for more."""
+        data = self._rest + data
+        used = yield from self._codec.read(data, more=True)
+        self._rest = data[used:]
 
 
 def frame_length(data: bytes, at: int) -> int | None:

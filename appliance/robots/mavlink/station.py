@@ -20,7 +20,7 @@ from appliance.robots.ledger import KeyValues, Ledger
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.copter import Copter
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
-from appliance.robots.mavlink.endpoint import Endpoint
+from appliance.robots.mavlink.links import Address, Link, open_link
 from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 
@@ -32,8 +32,6 @@ _OFFLINE_INFO_S = 5.0
 """How often the roster is reminded of a vehicle that is offline."""
 _STREAMS_HZ = {"GLOBAL_POSITION_INT": 5.0, "SYS_STATUS": 1.0, "MISSION_CURRENT": 2.0, "HOME_POSITION": 0.2}
 """What is asked of a vehicle that has come online; ArduPilot sends little of it by itself."""
-
-Address = tuple[str, int]
 
 
 class _Attached:
@@ -69,7 +67,7 @@ class Station:
         self._gateway = gateway
         self._site = site
         self.refused = refused
-        self._endpoints: list[Endpoint] = []
+        self._links: list[Link] = []
         self._vehicles: dict[str, _Attached] = {}
         self._early: Counter[tuple[int, int]] = Counter()
         """Frames by system before its heartbeat; there are 255 systems a link."""
@@ -89,9 +87,8 @@ class Station:
         try:
             for index, link in enumerate(self._config.mavlink):
                 codec = Codec(self._config.system_id, self._config.component_id)
-                endpoint = await Endpoint.open(link.address(), codec, self._receiver(index, link), self.refused)
-                self._endpoints.append(endpoint)
-                log.info("MAVLink port open", listen=link.listen)
+                self._links.append(await open_link(link.remote, codec, self._receiver(index, link), self.refused))
+                log.info("MAVLink link open", link=str(link.remote), listens=link.remote.listens)
         except SwiftbotError:
             await self.stop()
             raise
@@ -116,9 +113,9 @@ class Station:
                 self._tell(each, "its gateway is stopping")
         self._vehicles.clear()
         self._by_source.clear()
-        for endpoint in self._endpoints:
-            await endpoint.close()
-        self._endpoints.clear()
+        for link in self._links:
+            await link.close()
+        self._links.clear()
         if self._watch is not None:
             self._watch.close()
             self._watch = None
@@ -201,9 +198,9 @@ class Station:
 
     def _send(self, index: int, name: str, message: Message) -> None:
         each = self._vehicles.get(name)
-        if each is None or index >= len(self._endpoints):
+        if each is None or index >= len(self._links):
             return
-        raw = self._endpoints[index].send(message, each.address)
+        raw = self._links[index].send(message, each.address)
         self._session.put(self._session.keys.mavlink(name, "tx"), raw, encoding=FRAME_ENCODING)
 
     # --- presence ----------------------------------------------------------------------------------------------
@@ -278,19 +275,24 @@ class Station:
             await asyncio.sleep(_TICK_S)
 
     def _beat(self) -> None:
-
-        for each in self._vehicles.values():
-            each.vehicle.send(
-                dialect.make(
-                    "HEARTBEAT",
-                    type=dialect.TYPE_ONBOARD,
-                    autopilot=dialect.AUTOPILOT_NONE,
-                    base_mode=0,
-                    custom_mode=0,
-                    system_status=dialect.STATE_ACTIVE,
-                    mavlink_version=3,
-                )
-            )
+        """Tell every vehicle, and every other end that may not have been heard yet, that the gateway is there."""
+        beat = dialect.make(
+            "HEARTBEAT",
+            type=dialect.TYPE_ONBOARD,
+            autopilot=dialect.AUTOPILOT_NONE,
+            base_mode=0,
+            custom_mode=0,
+            system_status=dialect.STATE_ACTIVE,
+            mavlink_version=3,
+        )
+        reached: set[tuple[int, Address]] = set()
+        for (index, _), each in self._by_source.items():
+            each.vehicle.send(beat)
+            reached.add((index, each.address))
+        for index, link in enumerate(self._links):
+            for other in link.others:
+                if (index, other) not in reached:
+                    link.send(beat, other)
 
     def _tell(self, each: _Attached, note: str = "") -> None:
         """Put the roster entry; the verbs follow from what the last heartbeat said it is."""

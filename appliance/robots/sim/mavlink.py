@@ -1,4 +1,4 @@
-"""A simulated MAVLink copter as a process of its own: it sends to a gateway's UDP port, as SITL's `--out` does.
+"""A simulated MAVLink copter as a process of its own: it sends to a gateway, as SITL's `--out` does, or waits for one.
 
 Its link can be made lossy, which is what radio links are: the same share of frames is dropped each way.
 """
@@ -15,8 +15,8 @@ from appliance.errors import ConfigError
 from appliance.model import Site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
-from appliance.robots.mavlink.endpoint import Endpoint
-from appliance.robots.settings import MAX_SYSTEM, udp_address
+from appliance.robots.mavlink.links import Link, open_link
+from appliance.robots.settings import MAX_SYSTEM, Remote, read_remote
 from appliance.robots.sim.copter import STREAMS_HZ, SimCopter
 from appliance.robots.sim.telemetry import telemetry
 
@@ -32,7 +32,9 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     """One simulated copter."""
 
     to: str = "udp://127.0.0.1:14550"
-    """Where the gateway listens."""
+    """Where the gateway listens, udp:// or tcp://."""
+    listen: bool = False
+    """Listen there with TCP instead, as SITL does, and let the gateway connect."""
     system: int = 1
     site: Site = field(default_factory=Site)
     start: str = "home"
@@ -44,9 +46,15 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     """Share of frames lost, each way."""
     seed: int = 1
 
+    @property
+    def remote(self) -> Remote:
+        """Where it speaks; ConfigError when that is not understood."""
+        return read_remote(self.to, listens=self.listen)
+
     def check(self) -> None:
         """Raise ConfigError for what cannot be simulated."""
-        udp_address(self.to)
+        if self.remote.listens and self.remote.scheme == "udp":
+            raise ConfigError(f"a simulated vehicle cannot listen on {self.to}", remedy="use tcp://host:port")
         if not 1 <= self.system <= MAX_SYSTEM:
             raise ConfigError(f"MAVLink system id {self.system}", remedy="use 1 to 255")
         if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
@@ -84,17 +92,15 @@ class Simulation:
     def __init__(self, settings: VehicleSettings, copter: SimCopter) -> None:
         self.copter = copter
         self._settings = settings
-        self._gateway = udp_address(settings.to)
         self._chance = random.Random(settings.seed)  # noqa: S311 - a lossy link, no secret
         self._intervals = {name: 1.0 / hz for name, hz in STREAMS_HZ.items()}
         self._due = dict.fromkeys(STREAMS_HZ, 0.0)
-        self._endpoint: Endpoint | None = None
+        self._link: Link | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until `stop` is set."""
         codec = Codec(self._settings.system, dialect.COMPONENT_AUTOPILOT)
-        host = "127.0.0.1" if self._gateway[0] in ("127.0.0.1", "localhost") else "0.0.0.0"  # noqa: S104 - must reach another host
-        self._endpoint = await Endpoint.open((host, 0), codec, self._heard)
+        self._link = await open_link(self._settings.remote, codec, self._heard)
         log.info("simulated copter", system=self._settings.system, to=self._settings.to)
         began = before = time.monotonic()
         try:
@@ -113,18 +119,15 @@ class Simulation:
                 except TimeoutError:
                     continue
         finally:
-            await self._endpoint.close()
+            await self._link.close()
 
     def _heard(self, frame: Frame, address: tuple[str, int]) -> None:
-        if address != self._gateway_address(address) or self._lost():
+        del address
+        if self._lost():
             return
         if frame.name == "COMMAND_LONG" and frame.message.command == dialect.SET_INTERVAL:
             self._set_interval(frame.message)
         self._send(self.copter.handle(frame, time.monotonic()))
-
-    def _gateway_address(self, address: tuple[str, int]) -> tuple[str, int]:
-        """Return the gateway's address; its port decides where it is named by host name."""
-        return (address[0], self._gateway[1])
 
     def _set_interval(self, message: Message) -> None:
         """Take a wish for a stream: microseconds, 0 for the usual, -1 for none."""
@@ -136,11 +139,12 @@ class Simulation:
 
     def _send(self, messages: list[Message]) -> None:
         for message in messages:
-            if self._endpoint is not None:
-                if self._lost():
-                    self._endpoint.codec.pack(message)  # it was sent, as its sequence number tells, and lost
-                else:
-                    self._endpoint.send(message, self._gateway)
+            if self._link is None:
+                return
+            raw = self._link.codec.pack(message)
+            for other in self._link.others:
+                if not self._lost():  # a lost one was sent all the same, as the next sequence number tells
+                    self._link.transmit(raw, other)
 
     def _lost(self) -> bool:
         return self._settings.drop > 0 and self._chance.random() < self._settings.drop

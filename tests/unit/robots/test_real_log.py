@@ -6,8 +6,9 @@ from pathlib import Path
 
 from appliance.model import Site
 from appliance.robots.mavlink.dialect import Codec, Frame, frame_length
-from appliance.robots.mavlink.endpoint import Endpoint
+from appliance.robots.mavlink.links.udp import UdpServer
 from appliance.robots.mavlink.vehicle import Vehicle
+from appliance.robots.settings import Remote
 
 
 def test_a_real_dive_is_read_whole(shared: Path) -> None:
@@ -23,19 +24,19 @@ def test_a_real_dive_is_read_whole(shared: Path) -> None:
             vehicle.hear(frame, 0.0)
             modes.add(vehicle.armed)
 
-    endpoint = Endpoint(Codec(245, 191), heard)
+    link = UdpServer(Remote("udp", "127.0.0.1", 0, True), Codec(245, 191), heard)
     at = records = 0
     while at < len(data):
         (stamp,) = struct.unpack_from(">Q", data, at)
         length = frame_length(data, at + 8)
         assert length is not None
         assert 1_600_000_000 < stamp / 1e6 < 1_800_000_000
-        endpoint.feed(data[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
+        link.feed(data[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
         records += 1
         at += 8 + length
     assert records == 35_916
-    assert endpoint.received == 35_912
-    assert endpoint.refused == {"checksum": 4}
+    assert link.received == 35_912
+    assert link.refused == {"checksum": 4}
     assert names["HEARTBEAT"] == 1056
     assert vehicle.kind == 12  # MAV_TYPE_SUBMARINE
     assert not vehicle.commandable

@@ -3,14 +3,14 @@
 import pytest
 
 from appliance.errors import ConfigError
-from appliance.robots.settings import MavlinkLink, RobotsConfig, udp_address
+from appliance.robots.settings import MavlinkLink, RobotsConfig, read_remote
 
 
-@pytest.mark.parametrize("url", ["", "127.0.0.1:14550", "tcp://a:1", "udp://a", "udp://a:99999", "udp://a:1/x"])
+@pytest.mark.parametrize("url", ["", "127.0.0.1:14550", "http://a:1", "udp://a", "udp://a:99999", "udp://a:1/x"])
 def test_addresses_that_are_none(url: str) -> None:
-    """Anything but udp://host:port is a ConfigError that says how to write it."""
-    with pytest.raises(ConfigError, match="udp://host:port"):
-        udp_address(url)
+    """Anything but udp:// or tcp://host:port is a ConfigError that says how to write it."""
+    with pytest.raises(ConfigError, match="udp://host:port or tcp://host:port"):
+        read_remote(url, listens=True)
 
 
 def test_names_of_systems() -> None:
@@ -29,6 +29,8 @@ def test_names_of_systems() -> None:
         RobotsConfig(mavlink=(MavlinkLink(names={"x": "a"}),)),
         RobotsConfig(mavlink=(MavlinkLink(names={"1": "Not A Name"}),)),
         RobotsConfig(mavlink=(MavlinkLink(prefix="Drone "),)),
+        RobotsConfig(mavlink=(MavlinkLink(), MavlinkLink(listen="udp://127.0.0.1:14550"))),
+        RobotsConfig(mavlink=(MavlinkLink(listen="tcp://127.0.0.1:1", connect="tcp://127.0.0.1:2"),)),
         RobotsConfig(system_id=0),
     ],
 )
