@@ -1,0 +1,74 @@
+"""Whether two instructions are the same but for their nouns: what must not be between training and test data.
+
+Two measures. The skeleton of an instruction is what is left when names, places, objects and figures, that is, the
+words of its plan's parameters, are blanked: equal skeletons are one sentence with other nouns. And words in common
+(Jaccard index of word sets, stop words left out) find copies whose order or small words changed.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+
+from appliance.llm.corpus.check import stem
+from appliance.model import Subtask
+
+LITERAL = 4
+"""Skeletons with fewer words than this of their own ("go to _ and inspect _") cannot but be alike."""
+SHARED = 0.75
+"""Share of words in common from which on two instructions are copies."""
+_WORD = re.compile(r"[a-z0-9]+")
+_STOP = frozenset(
+    {"the", "a", "an", "of", "to", "in", "on", "at", "and", "then", "it", "is", "please", "you", "your", "for", "with"}
+    | {"from", "by"}
+)
+
+
+def skeleton(instruction: str, subtasks: Sequence[Subtask]) -> tuple[str, ...]:
+    """Return the words of an instruction with every run of words from its plan's parameters as one `_`."""
+    nouns: set[str] = {"robot", "drone"}
+    for subtask in subtasks:
+        for value in (subtask.robot, *subtask.params.values()):
+            for text in value if isinstance(value, list) else [value]:  # pyright: ignore[reportUnknownVariableType]
+                nouns |= {stem(word) for word in _WORD.findall(str(text).lower())}  # pyright: ignore[reportUnknownArgumentType]
+    nouns -= _STOP
+    words: list[str] = []
+    for word in _WORD.findall(instruction.lower()):
+        blank = stem(word) in nouns or word[0].isdigit() or word[-1].isdigit()
+        if not blank:
+            words.append(word)
+        elif words[-1:] != ["_"]:
+            words.append("_")
+    return tuple(words)
+
+
+def words(instruction: str) -> frozenset[str]:
+    """Return the words that count when copies are looked for."""
+    return frozenset(_WORD.findall(instruction.lower())) - _STOP
+
+
+def too_near(
+    pairs: Mapping[str, tuple[str, Sequence[Subtask]]],
+    others: Mapping[str, tuple[str, Sequence[Subtask]]] | None = None,
+) -> Iterable[str]:
+    """Yield a sentence for each pair that copies one of `others`, or, without these, an earlier pair of its own.
+
+    Args:
+        pairs: instruction and plan, by a name that says where they are.
+        others: a test set, laid out alike.
+    """
+    frames: dict[tuple[str, ...], str] = {}
+    bags: list[tuple[str, frozenset[str]]] = []
+    for name, (instruction, subtasks) in (others or {}).items():
+        frames.setdefault(skeleton(instruction, subtasks), name)
+        bags.append((name, words(instruction)))
+    for name, (instruction, subtasks) in pairs.items():
+        frame, bag = skeleton(instruction, subtasks), words(instruction)
+        if sum(word != "_" and word not in _STOP for word in frame) >= LITERAL and frame in frames:
+            yield f"{name}: the same sentence as {frames[frame]} with other nouns"
+        for other, there in bags:
+            shared = len(bag & there)
+            if bag == there or (shared >= 3 and shared >= SHARED * len(bag | there)):
+                yield f"{name}: has most words in common with {other}"
+                break
+        if others is None:
+            frames.setdefault(frame, name)
+            bags.append((name, bag))
