@@ -1,13 +1,17 @@
 """Measurements: `swiftbot bench …`."""
 
 import asyncio
+import signal
+from collections.abc import Coroutine
 from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from appliance import console
 from appliance.cli.common import TOOLS, Json, show
 
+T = TypeVar("T")
 bench_app = App(name="bench", help="Measure a promise beside its alternative, in one run.", group=TOOLS)
 
 
@@ -16,18 +20,70 @@ def add_to(app: App) -> None:
     app.command(bench_app)
 
 
+def measure(work: Coroutine[Any, Any, T]) -> T:
+    """Run a measurement; SIGTERM ends it as Ctrl-C does, so that fleets, containers and folders go with it."""
+
+    async def ended_by_signal() -> T:
+        task = asyncio.current_task()
+        if task is not None:
+            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+        return await work
+
+    try:
+        return asyncio.run(ended_by_signal())
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
+
+
 @bench_app.command
-def startup(*, count: int = 100, cold: int = 5, image: str = "base", as_json: Json = False) -> int:
-    """Subtask startup: cold containers, warm local ones, warm ones found on another gateway, in one run.
+def startup(*, count: int = 100, cold: int = 5, image: str = "base", ray: bool = True, as_json: Json = False) -> int:
+    """Subtask startup: cold containers, warm local ones, warm ones of other gateways, Ray's actors, in one run.
 
     Args:
         count: Warm runs of each kind.
         cold: Cold runs.
         image: Image of the containers.
+        ray: Measure Ray's actors beside them, if `make ray` has installed it.
     """
     from appliance.bench.federated import run_all
 
-    result = asyncio.run(run_all(count, cold, image=image, progress=console.err.print))
+    result = measure(run_all(count, cold, image=image, ray=ray, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0
+
+
+@bench_app.command
+def rate(
+    *,
+    mode: tuple[Literal["cold", "local", "federated"], ...] = ("cold", "local", "federated"),
+    spread: tuple[Literal["even", "uneven"], ...] = ("even", "uneven"),
+    rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0),
+    service_ms: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (0.0, 150.0),
+    seconds: float = 6.0,
+    limit_ms: float = 1000.0,
+    seed: int = 1,
+    image: str = "base",
+    as_json: Json = False,
+) -> int:
+    """p99 of the start against the arrival rate until it breaks: four gateways, arrivals even and uneven over them.
+
+    Args:
+        mode: Pool modes to measure; may be given several times.
+        spread: Even or uneven arrivals; may be given several times.
+        rates: Runs a second over all gateways, rising until one is too much.
+        service_ms: What a run works.
+        seconds: For how long each rate is offered.
+        limit_ms: p99 beyond which a rate is too much.
+        seed: Of the arrivals.
+        image: Image of the containers.
+    """
+    from appliance.bench.rate import Options, run
+
+    options = Options(
+        modes=mode, spreads=spread, rates=rates, services_ms=service_ms, seconds=seconds, limit_ms=limit_ms,
+        seed=seed, image=image,
+    )  # fmt: skip
+    result = measure(run(options, progress=console.err.print))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0
 
@@ -42,7 +98,7 @@ def bench_record(*, messages: int = 50_000, rounds: int = 3, as_json: Json = Fal
     """
     from appliance.bench.record import run as bench
 
-    result = asyncio.run(bench(messages=messages, rounds=rounds))
+    result = measure(bench(messages=messages, rounds=rounds))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0
 
@@ -57,6 +113,6 @@ def bench_plan(*, cases: Path | None = None, limit: int = 0, as_json: Json = Fal
     """
     from appliance.bench.plan import run as bench
 
-    result = asyncio.run(bench(cases, limit=limit, progress=console.err.print))
+    result = measure(bench(cases, limit=limit, progress=console.err.print))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0

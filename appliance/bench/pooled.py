@@ -1,0 +1,138 @@
+"""A pool of the benchmark's own in this process, with a skill that does what it is told: nothing, or a service time."""
+
+import secrets
+import tempfile
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+from msgspec import Struct
+
+from appliance.errors import PoolError, PrerequisiteError
+from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunRequest, Site
+from appliance.pool.engine import Engine
+from appliance.pool.pool import Call, Pool
+from appliance.pool.selection import Candidate
+from appliance.pool.settings import PoolConfig
+from appliance.skills.catalogue import load_catalogue
+
+WARM_UP_S = 60.0
+SKILL = "bench_nothing"
+MANIFEST = """
+id = "{skill}"
+domain = "coordination"
+summary = "Do nothing, to measure how long it takes to begin."
+runs = "compute"
+image = "{image}"
+cpu = 0.1
+memory_mb = 64
+"""
+_HANDLER = """
+import time
+
+
+def run(ctx):
+    time.sleep(float(ctx.params.get("service_ms", 0.0)) / 1e3)
+    return {}
+"""
+
+
+def write_skill(folder: Path, image: str, *, skill: str = SKILL, handler: str = _HANDLER) -> Path:
+    """Write a skill of the benchmark; returns the folder of skills it is in."""
+    where = folder / "skills" / skill
+    where.mkdir(parents=True)
+    (where / "skill.toml").write_text(MANIFEST.format(skill=skill, image=image))
+    (where / "handler.py").write_text(handler)
+    return where.parent
+
+
+def need_of(image: str) -> Need:
+    """Return what the benchmark's skill asks for."""
+    return Need(image=image, cpu=0.1, memory_mb=64)
+
+
+@asynccontextmanager
+async def pool(
+    config: PoolConfig, image: str, *, make_engine: Callable[[], Engine] | None = None
+) -> AsyncGenerator[Pool]:
+    """A pool of its own fleet, with a skill that does nothing, gone afterwards."""
+
+    async def nobody(need: Need) -> list[Candidate]:
+        del need
+        return []
+
+    async def nothing(call: Call) -> dict[str, Any]:
+        raise PoolError(f"{call.name} is not served here")
+
+    with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
+        skills = write_skill(Path(folder), image)
+        it = Pool(
+            config,
+            gateway="bench",
+            fleet=f"bench-{secrets.token_hex(4)}",
+            run_dir=Path(folder) / "run",
+            catalogue=load_catalogue([skills]),
+            site=Site(),
+            find_remote=nobody,
+            on_call=nothing,
+            on_change=lambda _: None,
+            make_engine=make_engine,
+        )
+        try:
+            await it.start()
+            if it.problem:
+                raise PrerequisiteError(it.problem, remedy="swiftbot doctor tells more")
+            yield it
+        finally:
+            await it.stop(keep_containers=False)
+
+
+async def warm(it: Pool, image: str, count: int) -> None:
+    """Wait until so many containers are ready.
+
+    Raises:
+        PrerequisiteError: they do not start.
+    """
+    until = time.monotonic() + WARM_UP_S
+    while sum(each.state is ContainerState.READY and each.image == image for each in it.containers()) < count:
+        if time.monotonic() > until or it.problem:
+            raise PrerequisiteError(it.problem or f"{count} containers of {image} did not start in {WARM_UP_S:g} s")
+        await anyio.sleep(0.02)
+
+
+class Took(Struct, frozen=True, kw_only=True):
+    """One run, milliseconds from asking for a container: to the handler's first line, and to its result."""
+
+    start_ms: float
+    round_trip_ms: float
+
+
+async def once(it: Pool, image: str, number: int) -> Took:
+    """Run the skill that does nothing once.
+
+    Raises:
+        PoolError: it did not work.
+    """
+    need = need_of(image)
+    request = RunRequest(task="bench", subtask=f"n{number}", attempt=1, skill=SKILL, need=need, deadline_s=10.0)
+    started: list[float] = []
+
+    def note(event: RunEvent) -> None:
+        if event.kind is RunEventKind.STARTED and event.startup_ms is not None:
+            started.append(event.startup_ms)
+
+    entered_ns = time.monotonic_ns()
+    decision = await it.select(need, allow_remote=False)
+    selected_ns = time.monotonic_ns()
+    final = await it.run(request, decision, note)
+    ended_ns = time.monotonic_ns()
+    if final.kind is not RunEventKind.SUCCEEDED or not started:
+        reason = final.failure.message if final.failure else "it never started"
+        raise PoolError(f"run {number} did not work: {reason}")
+    # `startup_ms` begins when the pool is asked to run; selecting belongs to it.
+    return Took(
+        start_ms=started[0] + (selected_ns - entered_ns) / 1e6, round_trip_ms=(ended_ns - entered_ns) / 1e6
+    )

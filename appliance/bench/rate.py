@@ -1,0 +1,241 @@
+"""p99 of the start against the arrival rate, until it breaks, and why: four gateways, all modes, even and uneven.
+
+Each mode gets a fleet of its own with the same containers, memory and queue; only how it uses them differs:
+
+    cold       a new container for each run
+    local      the paper's baseline: warm containers of this gateway only, kept for ten minutes after their last run
+    federated  those of other gateways too
+
+Rates are offered in rising order as an open loop (`load`), with a pause in between until nothing runs any more; the
+first one that is too much ends the ladder. All of it shares the machine with the fleet, and the sender is seen too.
+"""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import psutil
+from msgspec import Struct
+
+from appliance.bench import fleet
+from appliance.bench.figures import ratio
+from appliance.bench.fleet import Orders, Progress
+from appliance.bench.load import Sampled, Spread, account, arrivals, breaking, verdict, window_s
+from appliance.errors import ConfigError
+from appliance.local_fleet import FleetState
+from appliance.pool.settings import PoolConfig
+
+Mode = Literal["cold", "local", "federated"]
+MODES: tuple[Mode, ...] = ("cold", "local", "federated")
+SPREADS: tuple[Spread, ...] = ("even", "uneven")
+RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
+GATEWAYS = ("gw-1", "gw-2", "gw-3", "gw-4")
+PER_GATEWAY = 4
+"""Containers that a gateway may hold: 4 busy for 150 ms serve 26 runs/s, so uneven arrivals overload one gateway
+where all four together are not half busy."""
+PROMISED_P99_MS = 60.0
+PROMISED_RATE = 20.0
+PROMISED_UNEVEN = 1.5
+"""How many times lower federated p99 is than local p99 when arrivals are uneven."""
+SETTLE_S = 30.0
+SAMPLE_S = 0.1
+
+
+class Options(Struct, frozen=True, kw_only=True):
+    """What to measure. The default takes about ten minutes."""
+
+    modes: tuple[Mode, ...] = MODES
+    spreads: tuple[Spread, ...] = SPREADS
+    rates: tuple[float, ...] = RATES
+    services_ms: tuple[float, ...] = (0.0, 150.0)
+    """What the handler sleeps: 0 is the start alone; with 150 it matters how many run at once."""
+    seconds: float = 6.0
+    """For how long a rate is offered."""
+    least: int = 12
+    """Runs of a slow rate, which is offered longer for it, up to `most_s`."""
+    most_s: float = 12.0
+    limit_ms: float = 1000.0
+    """p99 beyond which a load is too much."""
+    seed: int = 1
+    image: str = "base"
+
+    def check(self) -> None:
+        """Raise ConfigError for what cannot be measured."""
+        if not self.rates or not all(0 < rate <= 1000 for rate in self.rates):
+            raise ConfigError("rates are runs a second, above 0 and up to 1000")
+        if not (0 < self.seconds <= 600 and all(0 <= each <= 5000 for each in self.services_ms)):
+            raise ConfigError("at most 600 seconds for each rate, and at most 5000 ms of service")
+
+
+def pool_of(mode: Mode, image: str) -> PoolConfig:
+    """Return the pool of one gateway in a mode: in all of them as many containers, as much memory, the same queue."""
+    floor = {} if mode == "cold" else {image: 1}
+    return PoolConfig(
+        mode=mode, floor=floor, capacity=PER_GATEWAY, memory_mb=PER_GATEWAY * 256, container_memory_mb=256, idle_s=600.0
+    )
+
+
+async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
+    """Measure as `options` say.
+
+    Returns:
+        `ladders`: for each mode, spread and service time its `cells` by rate (see `load.account`) and where it
+        `breaks`; `targets`: the promises and what was reached.
+
+    Raises:
+        ConfigError: something cannot be measured as told.
+    """
+    options.check()
+    ladders: list[dict[str, Any]] = []
+    for mode in options.modes:
+        pools = dict.fromkeys(GATEWAYS, pool_of(mode, options.image))
+        async with fleet.running(pools, image=options.image, progress=progress) as (state, orders):
+            for service_ms in options.services_ms:
+                for spread in options.spreads:
+                    progress(f"{mode}, {spread} arrivals, {service_ms:g} ms of work")
+                    ladders.append(await _ladder(options, mode, spread, service_ms, state, orders, progress))
+    return {
+        "unit": "ms",
+        "gateways": len(GATEWAYS),
+        "containers_per_gateway": PER_GATEWAY,
+        "seconds": options.seconds,
+        "seed": options.seed,
+        "limit_ms": options.limit_ms,
+        "ladders": ladders,
+        "targets": targets(ladders),
+    }
+
+
+async def _ladder(
+    options: Options, mode: Mode, spread: Spread, service_ms: float, state: FleetState, orders: Orders, progress: Progress
+) -> dict[str, Any]:
+    """Offer rising rates until one is too much."""
+    cells: dict[float, dict[str, Any]] = {}
+    whys: dict[float, list[str]] = {}
+    for name in state.gateways:  # each pays for its first run now
+        await orders.run(name)
+    for rate in sorted(options.rates):
+        await _settle(orders)
+        window = window_s(rate, seconds=options.seconds, least=options.least, most_s=options.most_s)
+        wanted = arrivals(rate, window, state.gateways, spread=spread, seed=options.seed)
+        watch = Watch(state, orders)
+        sampling = asyncio.create_task(watch.sample(), name="watch the machine")
+        try:
+            outcomes = await orders.offer(
+                wanted, service_ms=service_ms, patience_s=15.0 + service_ms / 1e3, began=watch.begin
+            )
+            seen = watch.end()
+        finally:
+            sampling.cancel()
+        cells[rate] = account(outcomes, seen) | {"seconds": round(window, 1)}
+        whys[rate] = verdict(outcomes, seen, limit_ms=options.limit_ms)
+        start = cells[rate]["start"]
+        progress(
+            f"  {rate:g}/s: {len(outcomes)} runs, start p50 {start.get('p50')} p99 {start.get('p99')} ms, "
+            f"CPU {seen.cpu:.0%}" + (f" - too much: {'; '.join(whys[rate])}" if whys[rate] else "")
+        )
+        if whys[rate]:
+            break
+    return {
+        "mode": mode,
+        "spread": spread,
+        "service_ms": service_ms,
+        "cells": {f"{rate:g}": cell for rate, cell in cells.items()},
+        "breaking": breaking(whys),
+    }
+
+
+async def _settle(orders: Orders) -> None:
+    """Wait until no gateway tells of runs in progress or waiting; a load that was too much takes a while."""
+    until = time.monotonic() + SETTLE_S
+    await asyncio.sleep(0.3)
+    while time.monotonic() < until:
+        gateways = orders.client.plane.registry.gateways.values()
+        if all(each.running == 0 and each.queue == 0 for each in gateways):
+            return
+        await asyncio.sleep(0.1)
+
+
+class Watch:
+    """Sees what the machine does while a load is on it."""
+
+    def __init__(self, state: FleetState, orders: Orders) -> None:
+        self._orders = orders
+        self._processes = {each.name: psutil.Process(each.pid) for each in state.processes}
+        self._processes["sender"] = psutil.Process()
+        self._queue: dict[str, int] = {}
+        self._began = 0.0
+        self._busy_s = 0.0
+        self._used_s: dict[str, float] = {}
+
+    def begin(self) -> None:
+        """Begin to count."""
+        self._began, self._busy_s, self._used_s = time.monotonic(), busy_s(), self._used()
+
+    async def sample(self) -> None:
+        """Note queue lengths until cancelled."""
+        while True:
+            for name, status in self._orders.client.plane.registry.gateways.items():
+                self._queue[name] = max(self._queue.get(name, 0), status.queue)
+            await asyncio.sleep(SAMPLE_S)
+
+    def end(self) -> Sampled:
+        """Return what was seen since `begin`."""
+        wall_s = max(1e-3, time.monotonic() - self._began)
+        used = self._used()
+        gateways = self._orders.client.plane.registry.gateways
+        return Sampled(
+            cpu=min(1.0, (busy_s() - self._busy_s) / wall_s / (psutil.cpu_count() or 1)),
+            daemons={name: (used[name] - before) / wall_s for name, before in self._used_s.items() if name in used},
+            queue=dict(self._queue),
+            containers={name: status.containers for name, status in sorted(gateways.items())},
+        )
+
+    def _used(self) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for name, process in self._processes.items():
+            try:
+                times = process.cpu_times()
+            except psutil.Error:  # it died: its gateway's runs tell
+                continue
+            found[name] = times.user + times.system
+        return found
+
+
+def busy_s() -> float:
+    """Return the seconds that all cores together have been busy since boot."""
+    times = psutil.cpu_times()
+    return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
+
+
+def targets(ladders: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the promises beside what was reached; those that were not measured are left out."""
+
+    def p99(mode: str, spread: str, service_ms: float, rate: float) -> float | None:
+        for each in ladders:
+            if (each["mode"], each["spread"], each["service_ms"]) == (mode, spread, service_ms):
+                return each["cells"].get(f"{rate:g}", {}).get("start", {}).get("p99")
+        return None
+
+    found: dict[str, Any] = {}
+    for spread in SPREADS:
+        reached = p99("federated", spread, 0.0, PROMISED_RATE)
+        if reached is not None:
+            found[f"p99_at_{PROMISED_RATE:g}_{spread}"] = {
+                "promised_ms": PROMISED_P99_MS, "reached_ms": reached, "kept": reached <= PROMISED_P99_MS,
+            }  # fmt: skip
+    times: dict[str, float] = {}
+    for each in ladders:
+        if (each["mode"], each["spread"]) == ("local", "uneven"):
+            for rate, cell in each["cells"].items():
+                below = p99("federated", "uneven", each["service_ms"], float(rate))
+                if (factor := ratio(cell["start"].get("p99"), below)) is not None:
+                    times[f"{each['service_ms']:g} ms at {rate}/s"] = factor
+    if times:
+        found["uneven_local_over_federated_p99"] = {
+            "promised": PROMISED_UNEVEN, "reached": times, "kept": max(times.values()) >= PROMISED_UNEVEN,
+        }  # fmt: skip
+    return found
+
+
