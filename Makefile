@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .SILENT:
 .NOTPARALLEL:
-.PHONY: help setup demo test check lint formatted types contracts unit format lock images install uninstall clean ready
+.PHONY: help setup demo test check lint formatted types contracts unit format lock images ray install uninstall clean ready
 
 # Taken as it is, without make expanding "$", and given on in the environment: any text may stand in it.
 override ASK := $(value ASK)
@@ -64,10 +64,15 @@ lock: ready ## Pin the dependencies anew in locks/ (UPGRADE=1: newest versions)
 	  "$$TOOLS/bin/uv" pip compile --quiet --python /usr/bin/python3 --generate-hashes --no-emit-index-url --no-header --no-annotate $(if $(UPGRADE),--upgrade) "$$@"; }; \
 	compile pyproject.toml -o locks/gateway.txt && \
 	compile pyproject.toml --group dev -c locks/gateway.txt -o locks/dev.txt && \
-	compile locks/tools.in -o locks/tools.txt
+	compile locks/tools.in -o locks/tools.txt && \
+	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' \
+	  | compile - -o locks/bench.txt
 
 images: setup ## Build the container images (setup does so too)
 	$(RUN) swiftbot images build
+
+ray: ## Ray, which `swiftbot bench startup` compares with, in an environment of its own (220 MB)
+	scripts/setup.sh gateway --without-images --with-ray
 
 install: ## Install as systemd services on this machine (DESTDIR=… for a package)
 	DESTDIR="$(DESTDIR)" scripts/install.sh

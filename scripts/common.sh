@@ -16,6 +16,7 @@ if [ "$(id -u)" -eq 0 ]; then
   USER_HOME=$BASE
   VENV=$BASE/venv
   TOOLS=$BASE/tools
+  RAY=$BASE/ray
   TREE=$BASE/work/swiftbot
   STATE=$BASE/setup
 else
@@ -25,6 +26,7 @@ else
   USER_HOME=$HOME
   VENV=$BASE
   TOOLS=$BASE/.tools
+  RAY=$BASE/.ray
   TREE=$PROJECT
   STATE=$BASE/.setup
 fi

@@ -69,9 +69,11 @@ async def run(count: int, cold: int, *, progress: Callable[[str], None]) -> dict
         "cold": found["cold"]["start_ms"],
     }
     result: dict[str, Any] = {"version": found["ready"]["version"], "ready_ms": round(found["ready"]["took_ms"])}
-    return result | {name: summary(each) for name, each in times.items()} | {
-        "cdf": {name: cdf(each) for name, each in times.items()}
-    }
+    return (
+        result
+        | {name: summary(each) for name, each in times.items()}
+        | {"cdf": {name: cdf(each) for name, each in times.items()}}
+    )
 
 
 @asynccontextmanager

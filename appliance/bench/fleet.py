@@ -11,11 +11,10 @@ import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 from appliance import local_fleet
 from appliance.bench.load import Arrival, Outcome
-from appliance.bench.pooled import SKILL, need_of, write_skill
+from appliance.bench.pooled import SKILL, fleet_name, need_of, write_skill
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
@@ -34,7 +33,7 @@ async def running(
     with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
         skills = write_skill(Path(folder), image)
         order = Order(
-            fleet=f"bench-{secrets.token_hex(4)}",
+            fleet=fleet_name(),
             directory=Path(folder) / "fleet",
             gateways=len(pools),
             mavlink=0,
@@ -117,21 +116,27 @@ class Orders:
         return outcome
 
     async def offer(
-        self, wanted: Sequence[Arrival], *, service_ms: float, patience_s: float, began: Callable[[], Any] = lambda: None
+        self,
+        wanted: Sequence[Arrival],
+        *,
+        service_ms: float,
+        patience_s: float,
+        sent: Callable[[], None] = lambda: None,
     ) -> list[Outcome]:
-        """Send orders when they are wanted, however those before them fare; returns when all have ended."""
+        """Send orders when they are wanted, however those before them fare; returns when all have ended.
+
+        `sent` is called when the last one has gone: from then on the fleet only works off what is left.
+        """
         runs: list[asyncio.Task[Outcome]] = []
-        began()
         start = time.monotonic()
         try:
             for each in wanted:
                 wait_s = start + each.at_s - time.monotonic()
                 if wait_s > 0:
                     await asyncio.sleep(wait_s)
-                work = self.run(
-                    each.gateway, service_ms=service_ms, intended=start + each.at_s, patience_s=patience_s
-                )
+                work = self.run(each.gateway, service_ms=service_ms, intended=start + each.at_s, patience_s=patience_s)
                 runs.append(asyncio.create_task(work, name="bench order"))
+            sent()
             return list(await asyncio.gather(*runs))
         except BaseException:
             for run in runs:

@@ -58,9 +58,7 @@ class Sampled(Struct, frozen=True, kw_only=True):
     """Containers held at the end, by gateway."""
 
 
-def arrivals(
-    rate: float, seconds: float, gateways: Sequence[str], *, spread: Spread, seed: int
-) -> tuple[Arrival, ...]:
+def arrivals(rate: float, seconds: float, gateways: Sequence[str], *, spread: Spread, seed: int) -> tuple[Arrival, ...]:
     """Return Poisson arrivals, the same for the same seed: exponential gaps of mean 1 / rate.
 
     Args:
@@ -86,7 +84,7 @@ def window_s(rate: float, *, seconds: float, least: int, most_s: float) -> float
 
 
 def account(outcomes: Sequence[Outcome], seen: Sampled) -> dict[str, Any]:
-    """Return the figures of one rate: start and end (ms), served and unserved, phases, the sender's lag, the machine."""
+    """Return the figures of one rate: start and end (ms), unserved, phases, the sender's lag, the machine."""
     sent = sorted(each.sent_ms for each in outcomes)
     return {
         "start": summary([each.started_ms for each in outcomes]),
@@ -129,9 +127,8 @@ def _causes(outcomes: Sequence[Outcome], seen: Sampled) -> list[str]:
     else:
         full = [name for name, cores in seen.daemons.items() if cores >= SATURATED]
         found += [f"CPU: {name} fills its one core" for name in full]
-    waiting = {name: length for name, length in seen.queue.items() if length}
-    if waiting:
-        lengths = ", ".join(f"{length} at {name}" for name, length in sorted(waiting.items(), key=lambda each: -each[1]))
+    if waiting := sorted(((length, name) for name, length in seen.queue.items() if length), reverse=True):
+        lengths = ", ".join(f"{length} at {name}" for length, name in waiting)
         found.append(f"queue: up to {lengths} waited for a container")
     cold = sum(each.phase == "cold" for each in outcomes)
     if cold:

@@ -6,20 +6,23 @@ import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import anyio
 from msgspec import Struct
 
 from appliance.errors import PoolError, PrerequisiteError
 from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunRequest, Site
-from appliance.pool.engine import Engine
+from appliance.pool.engine import ContainerSpec, Engine, PodmanEngine
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
 
+T = TypeVar("T")
 WARM_UP_S = 60.0
+FLEET = "bench"
+"""Fleets of benchmarks are called so, and have a random number behind it."""
 SKILL = "bench_nothing"
 MANIFEST = """
 id = "{skill}"
@@ -38,6 +41,31 @@ def run(ctx):
     time.sleep(float(ctx.params.get("service_ms", 0.0)) / 1e3)
     return {}
 """
+
+
+class WatchedEngine(PodmanEngine):
+    """Podman, with an account of what was asked of it."""
+
+    def __init__(self, url: str = "") -> None:
+        super().__init__(url)
+        self.requests = 0
+        self.created: list[str] = []
+        """Ids of all containers made."""
+
+    async def _ask(self, what: str, work: Callable[[Any], T]) -> T:
+        self.requests += 1
+        return await super()._ask(what, work)
+
+    async def create(self, spec: ContainerSpec) -> str:
+        """Make a container; its id is noted."""
+        container = await super().create(spec)
+        self.created.append(container)
+        return container
+
+
+def fleet_name() -> str:
+    """Return the name of a fleet of the benchmark's own."""
+    return f"{FLEET}-{secrets.token_hex(4)}"
 
 
 def write_skill(folder: Path, image: str, *, skill: str = SKILL, handler: str = _HANDLER) -> Path:
@@ -72,7 +100,7 @@ async def pool(
         it = Pool(
             config,
             gateway="bench",
-            fleet=f"bench-{secrets.token_hex(4)}",
+            fleet=fleet_name(),
             run_dir=Path(folder) / "run",
             catalogue=load_catalogue([skills]),
             site=Site(),
@@ -133,6 +161,4 @@ async def once(it: Pool, image: str, number: int) -> Took:
         reason = final.failure.message if final.failure else "it never started"
         raise PoolError(f"run {number} did not work: {reason}")
     # `startup_ms` begins when the pool is asked to run; selecting belongs to it.
-    return Took(
-        start_ms=started[0] + (selected_ns - entered_ns) / 1e6, round_trip_ms=(ended_ns - entered_ns) / 1e6
-    )
+    return Took(start_ms=started[0] + (selected_ns - entered_ns) / 1e6, round_trip_ms=(ended_ns - entered_ns) / 1e6)

@@ -38,6 +38,8 @@ PROMISED_P99_MS = 60.0
 PROMISED_RATE = 20.0
 PROMISED_UNEVEN = 1.5
 """How many times lower federated p99 is than local p99 when arrivals are uneven."""
+PATIENCE_S = 15.0
+"""A run that has not ended by then is lost: it waits for a container, or for a core."""
 SETTLE_S = 30.0
 SAMPLE_S = 0.1
 
@@ -89,7 +91,7 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
     options.check()
     ladders: list[dict[str, Any]] = []
     for mode in options.modes:
-        pools = dict.fromkeys(GATEWAYS, pool_of(mode, options.image))
+        pools = {name: pool_of(mode, options.image) for name in GATEWAYS}
         async with fleet.running(pools, image=options.image, progress=progress) as (state, orders):
             for service_ms in options.services_ms:
                 for spread in options.spreads:
@@ -108,7 +110,13 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 
 
 async def _ladder(
-    options: Options, mode: Mode, spread: Spread, service_ms: float, state: FleetState, orders: Orders, progress: Progress
+    options: Options,
+    mode: Mode,
+    spread: Spread,
+    service_ms: float,
+    state: FleetState,
+    orders: Orders,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Offer rising rates until one is too much."""
     cells: dict[float, dict[str, Any]] = {}
@@ -122,12 +130,10 @@ async def _ladder(
         watch = Watch(state, orders)
         sampling = asyncio.create_task(watch.sample(), name="watch the machine")
         try:
-            outcomes = await orders.offer(
-                wanted, service_ms=service_ms, patience_s=15.0 + service_ms / 1e3, began=watch.begin
-            )
-            seen = watch.end()
+            outcomes = await orders.offer(wanted, service_ms=service_ms, patience_s=PATIENCE_S, sent=watch.end)
         finally:
             sampling.cancel()
+        seen = watch.seen
         cells[rate] = account(outcomes, seen) | {"seconds": round(window, 1)}
         whys[rate] = verdict(outcomes, seen, limit_ms=options.limit_ms)
         start = cells[rate]["start"]
@@ -165,13 +171,8 @@ class Watch:
         self._processes = {each.name: psutil.Process(each.pid) for each in state.processes}
         self._processes["sender"] = psutil.Process()
         self._queue: dict[str, int] = {}
-        self._began = 0.0
-        self._busy_s = 0.0
-        self._used_s: dict[str, float] = {}
-
-    def begin(self) -> None:
-        """Begin to count."""
         self._began, self._busy_s, self._used_s = time.monotonic(), busy_s(), self._used()
+        self.seen = Sampled()
 
     async def sample(self) -> None:
         """Note queue lengths until cancelled."""
@@ -180,15 +181,15 @@ class Watch:
                 self._queue[name] = max(self._queue.get(name, 0), status.queue)
             await asyncio.sleep(SAMPLE_S)
 
-    def end(self) -> Sampled:
-        """Return what was seen since `begin`."""
+    def end(self) -> None:
+        """Sum up what was seen since it was made."""
         wall_s = max(1e-3, time.monotonic() - self._began)
         used = self._used()
         gateways = self._orders.client.plane.registry.gateways
-        return Sampled(
+        self.seen = Sampled(
             cpu=min(1.0, (busy_s() - self._busy_s) / wall_s / (psutil.cpu_count() or 1)),
             daemons={name: (used[name] - before) / wall_s for name, before in self._used_s.items() if name in used},
-            queue=dict(self._queue),
+            queue=self._queue,
             containers={name: status.containers for name, status in sorted(gateways.items())},
         )
 
@@ -237,5 +238,3 @@ def targets(ladders: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "promised": PROMISED_UNEVEN, "reached": times, "kept": max(times.values()) >= PROMISED_UNEVEN,
         }  # fmt: skip
     return found
-
-

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from appliance.bench import pooled
 from appliance.bench.figures import cdf, ratio, summary
 from appliance.errors import PrerequisiteError
-from appliance.pool.engine import PodmanEngine
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import image_reference
 
@@ -55,15 +54,15 @@ async def run(
     async with pooled.pool(replace(config, mode="cold", floor={}), image) as it:
         cold_ms = [(await pooled.once(it, image, number)).start_ms for number in range(cold)]
     progress(f"local: {count} runs in warm containers")
-    engine = PodmanEngine(config.podman_url)
+    engine = pooled.WatchedEngine(config.podman_url)
     # None is replaced while they are measured, so that Podman is asked for nothing but what a warm run needs.
     warm_pool = replace(config, mode="local", floor={image: 2}, capacity=2, max_runs=count + 10)
     async with pooled.pool(warm_pool, image, make_engine=lambda: engine) as it:
         await pooled.warm(it, image, 2)
         await pooled.once(it, image, count)  # the first one pays for lazy imports on this side
-        before = engine.calls
+        before = engine.requests
         local = [await pooled.once(it, image, number) for number in range(count)]
-        calls = engine.calls - before
+        calls = engine.requests - before
     times = {
         "podman_run": podman_ms,
         "cold": cold_ms,

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from pool_bench import Bench, engine_ids
 
-from appliance.bench.startup import run as bench_startup
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 from appliance.model import ContainerState, Phase, RunEvent, RunEventKind
 from appliance.pool import images
@@ -229,11 +228,3 @@ async def test_images_that_are_there_are_kept(built: None) -> None:
         assert (await images.build(name, catalogue, progress=lines.append)).startswith(f"localhost/swiftbot/{name}:")
     assert all(line.endswith("is there") for line in lines)
     assert all(each.present and each.size_bytes > 2**20 for each in await images.list_images(catalogue))
-
-
-async def test_benchmark(built: None) -> None:
-    """The benchmark measures cold and warm in one run, and leaves no container."""
-    result = await bench_startup(5, 1)
-    assert result["local"]["count"] == 5
-    assert result["cold"]["p50"] > result["local"]["p50"] > 0
-    assert set(result["local"]) == {"count", "p50", "p90", "p99", "max"}

@@ -1,0 +1,135 @@
+"""Each benchmark on real containers, with counts as small as they go: that it measures, and leaves nothing."""
+
+import asyncio
+import secrets
+import signal
+import stat
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from appliance.bench import actors, federated, pooled, rate, startup
+from appliance.pool.engine import PodmanEngine
+
+pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
+
+
+async def fleets_with_containers() -> list[str]:
+    """Return the fleets of all containers."""
+    engine = PodmanEngine(threads=1)
+    try:
+        found = await engine.containers({})
+    finally:
+        engine.close()
+    return [each.labels.get("swiftbot.fleet", "") for each in found]
+
+
+async def test_startup(built: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cold and warm are measured in one run; a warm run asks nothing of Podman; no container is left."""
+    mine = f"bench-{secrets.token_hex(4)}"
+    monkeypatch.setattr(pooled, "FLEET", mine)
+    result = await startup.run(5, 1)
+    assert result["local"]["count"] == result["local_round_trip"]["count"] == 5
+    assert result["cold"]["p50"] > result["local"]["p50"] > 0
+    assert result["local_round_trip"]["p50"] > result["local"]["p50"]
+    assert set(result["local"]) == {"count", "p50", "p90", "p99", "max"}
+    assert result["cdf"]["local"][-1][1] == 1.0
+    assert result["podman_calls_per_warm_run"] == 0
+    assert not any(each.startswith(mine) for each in await fleets_with_containers())
+
+
+@pytest.mark.fleet
+async def test_four_gateways(built: None) -> None:
+    """Each way is served in its own phase; all figures are there."""
+    result = await federated.run(2, 1, image="base", progress=lambda _: None)
+    assert {name: result[name]["count"] for name in ("ordered", "federated", "cold_ordered")} == {
+        "ordered": 2, "federated": 2, "cold_ordered": 1,
+    }  # fmt: skip
+    assert result["cold_ordered"]["p50"] > result["federated"]["p50"] > 0
+
+
+@pytest.mark.fleet
+async def test_rates(built: None) -> None:
+    """Two rates of one mode: cells, phases and what the machine did are told; an open loop loses no run."""
+    options = rate.Options(
+        modes=("federated",), spreads=("uneven",), rates=(4.0, 8.0), services_ms=(50.0,), seconds=1.0, least=4,
+        most_s=1.0, limit_ms=60_000.0,
+    )  # fmt: skip
+    told: list[str] = []
+    result = await rate.run(options, progress=told.append)
+    (ladder,) = result["ladders"]
+    assert set(ladder["cells"]) == {"4", "8"}
+    for cell in ladder["cells"].values():
+        assert cell["start"]["count"] == sum(cell["phases"].values()) + sum(cell["unserved"].values())
+        assert set(cell["cores_by_process"]) == {"gw-1", "gw-2", "gw-3", "gw-4", "recorder", "sender"}
+    assert any("8/s" in each for each in told)
+
+
+@pytest.mark.fleet
+async def test_interrupted(built: None, project_root: Path) -> None:
+    """Ctrl-C in mid-run ends the command with 130, and takes the fleet, its containers and its folder along."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "appliance.cli", "bench", "rate", "--mode", "federated", "--rates", "2",
+        "--seconds", "300", "--json",
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, cwd=project_root,
+    )  # fmt: skip
+    assert process.stderr is not None
+    try:
+        lines: list[str] = []
+        while not any("arrivals" in each for each in lines):
+            line = (await process.stderr.readline()).decode()
+            assert line, lines
+            lines.append(line)
+        daemons = [each.pid for each in psutil.Process(process.pid).children()]
+        assert len(daemons) == 5
+        process.send_signal(signal.SIGINT)
+        left = (await process.stderr.read()).decode()
+        assert await process.wait() == 130, left
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    assert not any(psutil.pid_exists(pid) for pid in daemons)
+    (started,) = (each for each in lines if each.startswith("started "))
+    fleet = started.split()[-1]
+    assert fleet.startswith("bench-")
+    assert fleet not in await fleets_with_containers()
+
+
+async def test_without_ray(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where Ray is not installed the result says so and how to get it, and nothing is compared."""
+    monkeypatch.setattr(actors, "find_python", lambda: None)
+    found = await actors.run(1, 1, progress=lambda _: None)
+    assert "make ray" in found["remedy"]
+    assert actors.compare({"ray": found, "local": {"p50": 1.0}}) == {}
+
+
+FAKE = """#!{python}
+import json, sys
+warm, cold = int(sys.argv[3]), int(sys.argv[4])
+print("a line of Ray's own")
+print(json.dumps({{"event": "ready", "version": "0", "took_ms": 1.0}}))
+print(json.dumps({{"event": "warm", "start_ms": [0.5] * warm, "round_trip_ms": [1.0] * warm}}))
+print(json.dumps({{"event": "cold", "start_ms": [500.0] * cold}}), flush=True)
+"""
+
+
+async def test_the_talk_with_rays_side(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What Ray's side tells becomes figures and ratios of medians; one that breaks is an error with its last words."""
+    fake = tmp_path / "python"
+    fake.write_text(FAKE.format(python=sys.executable))
+    fake.chmod(fake.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("SWIFTBOT_RAY_PYTHON", str(fake))
+    result: dict[str, Any] = {"local": {"p50": 1.0}, "local_round_trip": {"p50": 2.0}, "federated": {"p50": 10.0}}
+    result["ray"] = await actors.run(4, 2, progress=lambda _: None)
+    assert result["ray"]["start"]["count"] == 4
+    assert actors.compare(result)["against_ray"] == {
+        "local_over_ray_start": 2.0, "local_over_ray_round_trip": 2.0,
+        "ray_cold_over_local": 500.0, "ray_cold_over_federated": 50.0,
+    }  # fmt: skip
+    fake.write_text(f"#!{sys.executable}\nraise SystemExit('no such thing')\n")
+    with pytest.raises(actors.PoolError, match="no such thing"):
+        await actors.run(1, 1, progress=lambda _: None)
