@@ -176,6 +176,10 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     progress: float = 0.0
     note: str = ""
     """What it does or waits for just now."""
+    partial: dict[str, Any] | None = None
+    """The last partial result that its run told, cut to size; gone once there is a result."""
+    checkpoint_ns: int = 0
+    """When its last checkpoint was kept, from which the next attempt would go on; 0 when there is none."""
     attempts: tuple[Attempt, ...] = ()
     result: dict[str, Any] | None = None
     failure: Failure | None = None

@@ -9,7 +9,7 @@ same attempt.
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -21,7 +21,6 @@ from appliance.model import (
     Plan,
     RunEvent,
     RunEventKind,
-    RunRequest,
     SubtaskRecord,
     SubtaskState,
     TaskRecord,
@@ -29,10 +28,12 @@ from appliance.model import (
     VersionVector,
 )
 from appliance.tasks import machine
-from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.bounds import MAX_RUN_S, clean, tidy
+from appliance.tasks.api import RunStatus
+from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, tidy
 from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import TransitionKind
+from appliance.tasks.orders import Orders, request_for
+from appliance.tasks.partials import Partials, shown
 from appliance.tasks.surroundings import (
     CancelAsked,
     GatewayLost,
@@ -41,11 +42,11 @@ from appliance.tasks.surroundings import (
     Surroundings,
     Wake,
     deadline_s,
-    need_of,
 )
 
 log = structlog.get_logger(__name__)
 
+_LEAST = (RunEventKind.PROGRESS, RunEventKind.PARTIAL, RunEventKind.CHECKPOINT)
 MAX_INBOX = 1000
 """News that may wait for a driver; beyond it progress is dropped, beyond twice that what checks find out anyway."""
 
@@ -70,13 +71,12 @@ class Driver(Keeper):
         """Why the task is to be ended instead of driven: earlier drivers of it broke."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
         self._not_before: dict[str, float] = {}
-        self._sent_at: dict[str, float] = {}
         self._waiting: dict[str, str] = {}
-        self._orders: set[asyncio.Task[object]] = set()
+        self._orders = Orders(around, self.tell)
+        self._partials = Partials()
         self._cancelled_at: float | None = None
         self._cancel_at: dict[str, float] = {}
         self._check_at = time.monotonic() + around.config.check_s
-        self._outgoing: list[tuple[str, RunRequest]] = []
 
     @property
     def waits(self) -> bool:
@@ -87,14 +87,14 @@ class Driver(Keeper):
         """Hand in what happened; never blocks. What is of no use, or too much, is dropped: checks make up for it."""
         if isinstance(news, RunNews) and not self._useful(news.event):
             return
-        least = isinstance(news, Wake) or (isinstance(news, RunNews) and news.event.kind is RunEventKind.PROGRESS)
+        least = isinstance(news, Wake) or (isinstance(news, RunNews) and news.event.kind in _LEAST)
         if self._inbox.qsize() >= (MAX_INBOX if least else 2 * MAX_INBOX) and not isinstance(news, CancelAsked):
             return
         self._inbox.put_nowait(news)
 
     def _useful(self, event: RunEvent) -> bool:
         """Whether an event is of a current attempt and tells something that the record keeps."""
-        if event.kind in (RunEventKind.LOG, RunEventKind.PARTIAL, RunEventKind.CHECKPOINT):
+        if event.kind is RunEventKind.LOG:
             return False
         current = next((each for each in self.record.subtasks if each.subtask.id == event.subtask), None)
         return current is not None and event.attempt == current.attempt and not current.state.final
@@ -115,11 +115,11 @@ class Driver(Keeper):
                 await self._check()
             await self._flush()
             self.ended = True
+            await self._around.forget_checkpoints(self.record)
         except SupersededError as error:
             log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
         finally:
-            for order in self._orders:
-                order.cancel()
+            self._orders.close()
 
     async def _next(self) -> Input:
         try:
@@ -129,7 +129,9 @@ class Driver(Keeper):
 
     def _pause_s(self) -> float:
         now = time.monotonic()
-        due = [at - now for at in (*self._not_before.values(), self._check_at) if at > now]
+        partial_at = self._partials.next_at()
+        wake_at = (*self._not_before.values(), self._check_at, *(() if partial_at is None else (partial_at,)))
+        due = [at - now for at in wake_at if at > now]
         return max(0.01, min([self._around.config.check_s, *due]))
 
     # --- taking up ------------------------------------------------------------------------------------------
@@ -183,6 +185,11 @@ class Driver(Keeper):
             self._end_runs()
             return
         now = time.monotonic()
+        for event in self._partials.due(now):
+            partial = self._transition(
+                TransitionKind.PARTIAL, subtask=event.subtask, attempt=event.attempt, result=shown(event.result)
+            )
+            self._take(partial, durable=False)
         for each in machine.ready(self.record):
             self._ready_ns.setdefault(each.subtask.id, time.monotonic_ns())
             if self.record.state is TaskState.RUNNING and self._not_before.get(each.subtask.id, 0.0) <= now:
@@ -217,56 +224,19 @@ class Driver(Keeper):
             self._wait(target, f"waits for a gateway: {placement.why}")
             return
         self._waiting.pop(subtask.id, None)
-        attempt = target.attempt + 1
+        request = request_for(self.record, target, manifest, robot=robot, coordinator=self._plane.gateway)
         gateway = placement.order[0]
         self._apply(
             self._transition(
-                TransitionKind.DISPATCHED, subtask=subtask.id, attempt=attempt, gateway=gateway, robot=robot
+                TransitionKind.DISPATCHED,
+                subtask=subtask.id,
+                attempt=request.attempt,
+                gateway=gateway,
+                robot=robot,
+                placed=clean(placement.why, MAX_NOTE),
             )
         )
-        request = RunRequest(
-            task=self.record.id,
-            subtask=subtask.id,
-            attempt=attempt,
-            skill=subtask.skill,
-            need=need_of(manifest),
-            robot=robot,
-            params=subtask.params,
-            inputs=self._inputs(target),
-            coordinator=self._plane.gateway,
-            deadline_s=deadline_s(manifest, subtask.params),
-        )
-        self._outgoing.append((gateway, request))
-
-    async def _send(self, gateway: str, request: RunRequest) -> None:
-        try:
-            accepted = await self._around.order(gateway, request)
-            if accepted.gateway != gateway:
-                # Passed on to a warm container: from now on that gateway answers for the run.
-                self.tell(RunNews(_event(request, accepted.gateway, RunEventKind.PROGRESS)))
-        except SwiftbotError as error:
-            failure = Failure(
-                code=error.code if error.code in ("refused", "pool") else "unreachable",
-                message=f"{gateway}: {error.message}",
-                remedy=error.remedy,
-                retryable=True,
-            )
-            self.tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
-        except Exception as error:  # the boundary to the executor here: the attempt fails, the task goes on
-            log.exception("run order broke", run=request.run_id, gateway=gateway)
-            failure = Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
-            self.tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
-
-    def _inputs(self, target: SubtaskRecord) -> dict[str, dict[str, Any]]:
-        """Results of the subtasks it comes after, directly or not: a report needs the picture two steps back."""
-        found: dict[str, dict[str, Any]] = {}
-        open_ids = list(target.subtask.after)
-        while open_ids:
-            before = self.record.of(open_ids.pop(0))
-            if before.subtask.id not in found:
-                found[before.subtask.id] = {"skill": before.subtask.skill, **(before.result or {})}
-                open_ids.extend(before.subtask.after)
-        return found
+        self._orders.add(gateway, request)
 
     def _wait(self, target: SubtaskRecord, reason: str) -> None:
         """Tell people why it waits, once per reason, and look again soon.
@@ -293,13 +263,15 @@ class Driver(Keeper):
             elif self._cancel_at.get(each.subtask.id, 0.0) <= now:
                 # Again and again: the first may overtake the order to run, or be lost.
                 self._cancel_at[each.subtask.id] = now + self._around.config.check_s
-                self._start(self._ask(each, "run_cancel"))
+                self._orders.cancel(each, self.record.id)
 
     # --- what happened --------------------------------------------------------------------------------------
 
     async def _handle(self, news: Input) -> None:
         match news:
             case RunNews(event):
+                if event.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+                    await self._orders.answered(event.subtask, event.attempt)
                 self._run_news(event)
             case GatewayLost(gateway):
                 for each in machine.active(self.record):
@@ -328,26 +300,37 @@ class Driver(Keeper):
             "container": event.container,
             "phase": event.phase,
         }
+        choice = self._orders.choice(event.subtask, event.attempt)
         match event.kind:
             case RunEventKind.STARTED:
                 ready_ns = self._ready_ns.get(event.subtask)
                 startup_ms = (time.monotonic_ns() - ready_ns) / 1e6 if ready_ns else event.startup_ms
-                self._take(self._transition(TransitionKind.STARTED, startup_ms=startup_ms, **common))
+                self._take(self._transition(TransitionKind.STARTED, startup_ms=startup_ms, choice=choice, **common))
             case RunEventKind.PROGRESS:
                 self._take(
                     self._transition(TransitionKind.PROGRESS, progress=event.progress, note=event.note, **common),
                     durable=False,
                 )
             case RunEventKind.SUCCEEDED:
+                self._partials.drop(event.subtask)
                 self._take(
                     self._transition(
-                        TransitionKind.SUCCEEDED, result=event.result, duration_ms=event.duration_ms, **common
+                        TransitionKind.SUCCEEDED,
+                        result=event.result,
+                        duration_ms=event.duration_ms,
+                        choice=choice,
+                        **common,
                     )
                 )
             case RunEventKind.FAILED:
                 failure = event.failure or Failure(code="internal", message="the run failed without a reason")
                 self._attempt_failed(target, failure, event.duration_ms)
-            case RunEventKind.LOG | RunEventKind.PARTIAL | RunEventKind.CHECKPOINT:
+            case RunEventKind.PARTIAL:
+                self._partials.add(event)
+            case RunEventKind.CHECKPOINT:
+                # The first one is written at once: whoever comes later must know that there is something to remove.
+                self._take(self._transition(TransitionKind.CHECKPOINT, **common), durable=not target.checkpoint_ns)
+            case RunEventKind.LOG:
                 pass
 
     def _attempt_failed(self, target: SubtaskRecord, failure: Failure, duration_ms: float | None) -> None:
@@ -362,8 +345,10 @@ class Driver(Keeper):
                 failure=failure,
                 give_up=give_up,
                 duration_ms=duration_ms,
+                choice=self._orders.choice(target.subtask.id, target.attempt),
             )
         )
+        self._partials.drop(target.subtask.id)
         if taken and not give_up:
             self._ready_ns[target.subtask.id] = time.monotonic_ns()
             self._not_before[target.subtask.id] = time.monotonic() + machine.retry_delay_s(target.attempt)
@@ -391,7 +376,7 @@ class Driver(Keeper):
         asked: list[SubtaskRecord] = []
         for each in machine.active(self.record):
             limit = self._limit_s(each)
-            silent_s = now - self._sent_at.setdefault(each.subtask.id, now)
+            silent_s = now - self._orders.silent_since(each.subtask.id, now)
             if each.gateway not in members:
                 await self._handle(GatewayLost(each.gateway))
             elif silent_s > limit + self._around.config.grace_s:
@@ -405,7 +390,7 @@ class Driver(Keeper):
 
     async def _ask_after(self, targets: Sequence[SubtaskRecord]) -> None:
         """Learn from their gateways what became of runs."""
-        answers = await asyncio.gather(*(self._ask(each, "run_status") for each in targets))
+        answers = await asyncio.gather(*(self._orders.ask(each, self.record.id, "run_status") for each in targets))
         for target, status in zip(targets, answers, strict=True):
             self._learn(target, status)
 
@@ -415,7 +400,7 @@ class Driver(Keeper):
             if target.gateway not in self._plane.members():
                 lost = f"{target.gateway} was lost"
         elif status.last is None:
-            sent = self._sent_at.get(target.subtask.id, 0.0)
+            sent = self._orders.sent_at(target.subtask.id)
             if not status.running and time.monotonic() - sent > self._around.config.run_timeout_s:
                 lost = f"{target.gateway} does not know the run"
         elif status.last.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
@@ -427,26 +412,8 @@ class Driver(Keeper):
         if lost:
             self._attempt_failed(target, Failure(code="unreachable", message=lost, retryable=True), None)
 
-    async def _ask(self, target: SubtaskRecord, verb: str) -> RunStatus | None:
-        ask = RunAsk(task=self.record.id, subtask=target.subtask.id, attempt=target.attempt)
-        try:
-            return await self._plane.rpc.call(target.gateway, verb, ask, RunStatus, timeout_s=2.0)
-        except SwiftbotError as error:
-            log.info("no word of a run", run=ask.run_id, gateway=target.gateway, reason=str(error))
-            return None
-
-    # --- orders ---------------------------------------------------------------------------------------------
-
     def _written(self) -> None:
-        outgoing, self._outgoing = self._outgoing, []
-        for gateway, request in outgoing:
-            self._sent_at[request.subtask] = time.monotonic()
-            self._start(self._send(gateway, request))
-
-    def _start(self, order: Coroutine[Any, Any, object]) -> None:
-        task = asyncio.create_task(order)
-        self._orders.add(task)
-        task.add_done_callback(self._orders.discard)
+        self._orders.go()
 
 
 def _with_failure(target: SubtaskRecord, failure: Failure) -> SubtaskRecord:
@@ -460,14 +427,3 @@ def _plan_failure(error: SwiftbotError) -> Failure:
     problems = error.problems if isinstance(error, PlanError) else ()
     message = error.message if not problems else f"{error.message}: {'; '.join(problems[:5])}"
     return Failure(code=error.code, message=message, remedy=error.remedy)
-
-
-def _event(request: RunRequest, gateway: str, kind: RunEventKind, failure: Failure | None = None) -> RunEvent:
-    return RunEvent(
-        task=request.task,
-        subtask=request.subtask,
-        attempt=request.attempt,
-        kind=kind,
-        gateway=gateway,
-        failure=failure,
-    )

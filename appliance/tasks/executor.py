@@ -34,6 +34,7 @@ from appliance.pool.selection import MOST_CONSIDERED, Decision
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
+from appliance.tasks.checkpoints import Checkpoints
 from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
 
@@ -65,6 +66,13 @@ class Executor:
         self._last: dict[str, RunEvent] = {}
         self._background: set[asyncio.Future[object]] = set()
         self._attempts: dict[tuple[str, str], int] = {}
+        self._checkpoints = Checkpoints(
+            plane.dht,
+            gateway=plane.gateway,
+            max_bytes=config.max_checkpoint_bytes,
+            tell=self._publish,
+            refuse=lambda what, reason: plane.session.refuse(what, reason=reason),
+        )
         self.draining = False
         self.on_change: Callable[[], None] = lambda: None
 
@@ -216,7 +224,10 @@ class Executor:
                 told = replace(told, startup_ms=told.startup_ms + waited_ms)
             if told.kind is RunEventKind.STARTED:
                 self._last[run_id] = told
-            self._publish(told)
+            if told.kind is RunEventKind.CHECKPOINT:
+                self._checkpoints.add(told)
+            else:
+                self._publish(told)
 
         begun = asyncio.create_task(self._keep(run_id, self._last[run_id]))
         try:
@@ -234,6 +245,7 @@ class Executor:
         final = tidy(final, max_result_bytes=self._config.max_result_bytes)
         self._remember(run_id, final)
         await begun
+        await self._checkpoints.end(final)
         # Kept before it is told: a coordinator that misses the event finds it here.
         await self._keep(run_id, final)
         self._publish(final)

@@ -24,6 +24,7 @@ from msgspec.structs import replace
 from appliance.errors import SwiftbotError
 from appliance.model import (
     Attempt,
+    Choice,
     Failure,
     Phase,
     Plan,
@@ -45,6 +46,10 @@ class TransitionKind(StrEnum):
     DISPATCHED = "dispatched"
     STARTED = "started"
     PROGRESS = "progress"
+    PARTIAL = "partial"
+    """A run told a partial result (`result`)."""
+    CHECKPOINT = "checkpoint"
+    """A checkpoint of a run was kept, from which the next attempt would go on."""
     SUCCEEDED = "succeeded"
     ATTEMPT_FAILED = "attempt failed"
     CANCEL = "cancel"
@@ -73,6 +78,10 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     note: str = ""
     result: dict[str, Any] | None = None
     failure: Failure | None = None
+    placed: str = ""
+    """On `dispatched`: why that gateway."""
+    choice: Choice | None = None
+    """How the container of the attempt was chosen, on the first transition after that was heard."""
     give_up: bool = False
     """Of a failed attempt: no further one will be made."""
 
@@ -171,14 +180,16 @@ def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
             progress=0.0,
             note=event.note,
             failure=None,
-            attempts=(*target.attempts, Attempt(number=event.attempt, gateway=event.gateway)),
+            attempts=(
+                *_faded(target.attempts),
+                Attempt(number=event.attempt, gateway=event.gateway, placed=event.placed),
+            ),
         ),
     )
 
 
 def _started(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _current(record, event, SubtaskState.DISPATCHED)
-    attempt = replace(target.attempts[-1], gateway=event.gateway, container=event.container, phase=event.phase)
     return _with(
         record,
         replace(
@@ -189,8 +200,34 @@ def _started(record: TaskRecord, event: Transition) -> TaskRecord:
             phase=event.phase,
             startup_ms=event.startup_ms,
             note="",
-            attempts=(*target.attempts[:-1], attempt),
+            attempts=_served(target, event),
         ),
+    )
+
+
+def _served(target: SubtaskRecord, event: Transition) -> tuple[Attempt, ...]:
+    """The attempts, the last with what is known now of where and how it was served."""
+    last = target.attempts[-1]
+    attempt = replace(
+        last,
+        gateway=event.gateway or last.gateway,
+        container=event.container or last.container,
+        phase=event.phase or last.phase,
+        choice=event.choice or last.choice,
+    )
+    return (*target.attempts[:-1], attempt)
+
+
+def _faded(attempts: tuple[Attempt, ...]) -> tuple[Attempt, ...]:
+    """The attempts so far, only the latest with all that was considered: a record must stay small."""
+    return (
+        tuple(
+            replace(each, choice=replace(each.choice, considered=()))
+            if each.choice and each.choice.considered
+            else each
+            for each in attempts[: 1 - KEPT_CHOICES]
+        )
+        + attempts[1 - KEPT_CHOICES :]
     )
 
 
@@ -202,6 +239,16 @@ def _progress(record: TaskRecord, event: Transition) -> TaskRecord:
     return _with(record, replace(target, progress=event.progress, note=event.note, gateway=gateway))
 
 
+def _partial(record: TaskRecord, event: Transition) -> TaskRecord:
+    target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+    return _with(record, replace(target, partial=event.result))
+
+
+def _checkpoint(record: TaskRecord, event: Transition) -> TaskRecord:
+    target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+    return _with(record, replace(target, checkpoint_ns=event.at_ns))
+
+
 def _succeeded(record: TaskRecord, event: Transition) -> TaskRecord:
     # A run that ends at once can be heard of by its result first: dispatched is as good as running here.
     target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
@@ -210,11 +257,13 @@ def _succeeded(record: TaskRecord, event: Transition) -> TaskRecord:
         state=SubtaskState.SUCCEEDED,
         progress=1.0,
         note="",
+        partial=None,
         result=event.result or {},
         duration_ms=event.duration_ms,
         gateway=event.gateway or target.gateway,
         container=event.container or target.container,
         phase=event.phase or target.phase,
+        attempts=_served(target, event),
     )
     return _with(record, done)
 
@@ -228,7 +277,8 @@ def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
         attempts = target.attempts
     else:
         target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
-        attempts = (*target.attempts[:-1], replace(target.attempts[-1], failure=event.failure))
+        last = replace(target.attempts[-1], failure=event.failure, choice=event.choice or target.attempts[-1].choice)
+        attempts = (*target.attempts[:-1], last)
     ended = replace(target, attempts=attempts, failure=event.failure, duration_ms=event.duration_ms, note="")
     if record.state is TaskState.CANCELLING:
         return _with(record, replace(ended, state=SubtaskState.CANCELLED))
@@ -306,6 +356,8 @@ _HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] 
     TransitionKind.DISPATCHED: _dispatched,
     TransitionKind.STARTED: _started,
     TransitionKind.PROGRESS: _progress,
+    TransitionKind.PARTIAL: _partial,
+    TransitionKind.CHECKPOINT: _checkpoint,
     TransitionKind.SUCCEEDED: _succeeded,
     TransitionKind.ATTEMPT_FAILED: _attempt_failed,
     TransitionKind.CANCEL: _cancel,
@@ -345,5 +397,7 @@ def gives_up(target: SubtaskRecord, failure: Failure, *, retries: int) -> bool:
 
 
 _NOT_ITS_FAULT = ("unreachable", "refused", "pool")
+KEPT_CHOICES = 3
+"""Attempts of a subtask whose record says all that was considered for them; of earlier ones what was decided."""
 MAX_DISPLACEMENTS = 8
 """Attempts lost to gateways before a subtask is given up: more than a fleet loses at once, yet bounded."""

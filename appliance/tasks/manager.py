@@ -12,6 +12,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import structlog
 from msgspec.structs import replace
@@ -48,6 +49,7 @@ from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_deep
+from appliance.tasks.checkpoints import read_checkpoint, remove_checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
 from appliance.tasks.machine import Transition, TransitionKind
@@ -374,6 +376,16 @@ class TaskManager:
         if gateway == self.plane.gateway:
             return await self._executor.run(request)
         return await self.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=self.config.run_timeout_s)
+
+    async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
+        """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""
+        return await read_checkpoint(self.plane.dht, task, subtask)
+
+    async def forget_checkpoints(self, record: TaskRecord) -> None:
+        """Remove the checkpoints of a task that has ended."""
+        for each in record.subtasks:
+            if each.checkpoint_ns:
+                await remove_checkpoint(self.plane.dht, record.id, each.subtask.id)
 
     # --- questions --------------------------------------------------------------------------------------------
 

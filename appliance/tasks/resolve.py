@@ -9,6 +9,7 @@ import msgspec
 
 from appliance.model import SubtaskState, TaskRecord
 from appliance.plane.dht import Record
+from appliance.tasks import checkpoints
 
 
 def stronger(one: bytes, other: bytes) -> bytes:
@@ -28,7 +29,9 @@ def _rank(value: bytes) -> tuple[int, int, int, tuple[int, ...], bytes]:
 
 
 def resolver(key: str, one: Record, other: Record) -> Record:
-    """Choose between concurrent versions of any record; tasks by `stronger`, others by their bytes."""
+    """Choose between concurrent versions of any record: tasks and checkpoints by what they say, others by bytes."""
     if key.startswith("task/"):
         return one if stronger(one.value, other.value) == one.value else other
+    if key.startswith(checkpoints.PREFIX) and one.deleted == other.deleted:
+        return one if checkpoints.stronger(one.value, other.value) == one.value else other
     return max(one, other, key=lambda record: (record.deleted, record.value))

@@ -1,4 +1,6 @@
-"""Forgets what nobody will ask for again: old finished tasks, and the effects of tasks that are forgotten.
+"""Forgets what nobody will ask for again: old finished tasks, and what is left over of tasks.
+
+That is the effects of tasks that are forgotten, and the checkpoints of tasks that have ended.
 
 Each gateway looks only at the records it owns, so nothing is removed twice and nobody is in charge. A removed task
 is still in the logs.
@@ -12,6 +14,7 @@ import structlog
 from appliance.errors import ConflictError, PayloadError, SwiftbotError
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
+from appliance.tasks import checkpoints
 from appliance.tasks.bounds import read_record
 from appliance.tasks.settings import TasksConfig
 
@@ -48,7 +51,11 @@ class Retention:
 
     async def round(self) -> int:
         """Remove what is due; returns how many records."""
-        due = [*await self._old_tasks(), *await self._orphaned_effects()]
+        due = [
+            *await self._old_tasks(),
+            *await self._orphaned("effect/", ended=False),
+            *await self._orphaned(checkpoints.PREFIX, ended=True),
+        ]
         for record in due[:AT_ONCE]:
             with contextlib.suppress(ConflictError):
                 await self._plane.dht.remove(record.key, expected=record.version)
@@ -67,17 +74,29 @@ class Retention:
                     finished.append((record.updated_ns, key))
         return [owned[key] for key in surplus(finished, self._config.keep_finished)]
 
-    async def _orphaned_effects(self) -> list[Record]:
-        """Effects whose task is gone. A task that runs is never gone, so its effects stay."""
-        owned = await self._owned("effect/")
+    async def _orphaned(self, prefix: str, *, ended: bool) -> list[Record]:
+        """Records whose task (the second part of their key) is gone, or `ended`.
+
+        A task that runs is never gone, so what belongs to it stays.
+        """
+        owned = await self._owned(prefix)
         orphaned: list[Record] = []
-        known: dict[str, bool] = {}
+        needed: dict[str, bool] = {}
         for key, stored in owned.items():
             task = key.split("/")[1]
-            if task not in known:
-                if len(known) >= AT_ONCE:
+            if task not in needed:
+                if len(needed) >= AT_ONCE:
                     break
-                known[task] = await self._plane.dht.read(f"task/{task}") is not None
-            if not known[task]:
+                needed[task] = await self._needed(task, ended=ended)
+            if not needed[task]:
                 orphaned.append(stored)
         return orphaned
+
+    async def _needed(self, task: str, *, ended: bool) -> bool:
+        stored = await self._plane.dht.read(f"task/{task}")
+        if stored is None or not ended:
+            return stored is not None
+        try:
+            return not read_record(stored.value).state.final
+        except PayloadError:
+            return True

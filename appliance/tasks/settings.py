@@ -26,6 +26,8 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Largest file a handler may store."""
     max_result_bytes: int = 48 * 1024
     """Largest result of a subtask, as JSON: 64 of them still fit into one record. Larger things are files."""
+    max_checkpoint_bytes: int = 256 * 1024
+    """Largest checkpoint of a run, as JSON: it travels with the order of the next attempt. Larger things are files."""
     retention_s: float = 60.0
     """How often old records are looked for."""
     keep_finished: int = 500

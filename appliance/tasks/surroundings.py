@@ -38,6 +38,14 @@ class Surroundings(Protocol):
         """Send a run order, to this gateway without a detour."""
         ...
 
+    async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
+        """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""
+        ...
+
+    async def forget_checkpoints(self, record: TaskRecord) -> None:
+        """Remove the checkpoints of a task that has ended."""
+        ...
+
 
 class RunNews(Struct, frozen=True):
     """A run event came."""

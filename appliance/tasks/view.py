@@ -29,6 +29,12 @@ class SubtaskView(Struct, frozen=True, kw_only=True):
     attempts: int
     progress: float
     note: str
+    partial: dict[str, Any] | None
+    """The last partial result, while there is none yet."""
+    checkpoint_ns: int | None
+    """When its last checkpoint was kept."""
+    way: str | None
+    """How its container came to serve the last attempt."""
     result: dict[str, Any] | None
     error: Failure | None
 
@@ -73,6 +79,7 @@ def view(record: TaskRecord) -> TaskView:
 
 def _subtask(record: SubtaskRecord) -> SubtaskView:
     subtask = record.subtask
+    choice = record.attempts[-1].choice if record.attempts else None
     return SubtaskView(
         id=subtask.id,
         skill=subtask.skill,
@@ -88,6 +95,9 @@ def _subtask(record: SubtaskRecord) -> SubtaskView:
         attempts=record.attempt,
         progress=record.progress,
         note=record.note,
+        partial=record.partial,
+        checkpoint_ns=record.checkpoint_ns or None,
+        way=str(choice.way) if choice else None,
         result=record.result,
         error=record.failure,
     )

@@ -15,6 +15,7 @@ import pytest
 
 from appliance.errors import ConflictError, NotFoundError, SwiftbotError, UnreachableError
 from appliance.model import (
+    Choice,
     Need,
     Phase,
     Plan,
@@ -134,6 +135,13 @@ class FakeDht:
         self.records[key] = Record(key=key, value=value, version=version)
         return version
 
+    async def remove(self, key: str, *, expected: VersionVector) -> None:
+        """Remove, if it has not moved on."""
+        await asyncio.sleep(0)
+        if self.records[key].version != expected:
+            raise ConflictError(f"{key} has moved on")
+        del self.records[key]
+
     async def local(self, prefix: str) -> list[Record]:
         """Return the shard."""
         await asyncio.sleep(0)
@@ -247,6 +255,7 @@ class FakePool:
         self.gate: asyncio.Event | None = None
         self.asked: list[tuple[bool, dict[str, int], dict[str, str]]] = []
         self.cancelled: list[str] = []
+        self.tells: dict[str, Callable[[RunEvent], None]] = {}
         self.runs: dict[str, asyncio.Future[RunEvent]] = {}
 
     async def select(
@@ -260,6 +269,7 @@ class FakePool:
 
     async def run(self, request: RunRequest, decision: Decision, on_event: Callable[[RunEvent], None]) -> RunEvent:
         """Wait for the test."""
+        self.tells[request.run_id] = on_event
         future = self.runs[request.run_id] = asyncio.get_running_loop().create_future()
         on_event(event(request, RunEventKind.STARTED, startup_ms=1.0))
         return await future
@@ -325,6 +335,10 @@ class FakeSurroundings:
         self.orders: asyncio.Queue[tuple[str, RunRequest]] = asyncio.Queue()
         self.refusals: list[Exception] = []
         self.passed_to = ""
+        self.checkpoints: dict[str, dict[str, Any]] = {}
+        self.forgotten: list[str] = []
+        self.choice: Choice | None = None
+        self.slow_answer: asyncio.Event | None = None
 
     async def plan(self, record: TaskRecord) -> Plan:
         """Return the plan or raise it."""
@@ -349,13 +363,25 @@ class FakeSurroundings:
         failed = {each.gateway for each in target.attempts if each.failure}
         return Placement(order=tuple(sorted(self.places, key=lambda each: each in failed)), why="none is there")
 
+    async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
+        """Return the prepared checkpoint."""
+        return self.checkpoints.get(subtask)
+
+    async def forget_checkpoints(self, record: TaskRecord) -> None:
+        """Remember for which task."""
+        self.forgotten.append(record.id)
+
     async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
         """Take an order, or refuse it."""
         self.orders.put_nowait((gateway, request))
         await asyncio.sleep(0)
         if self.refusals:
             raise self.refusals.pop(0)
-        return RunAccepted(gateway=self.passed_to or gateway, container="c1", phase=Phase.LOCAL_WARM)
+        if self.slow_answer is not None:
+            await self.slow_answer.wait()
+        return RunAccepted(
+            gateway=self.passed_to or gateway, container="c1", phase=Phase.LOCAL_WARM, choice=self.choice
+        )
 
 
 class Bench:

@@ -7,8 +7,10 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, PayloadError, RefusedError, UnreachableError
+from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
 from appliance.model import (
+    Choice,
+    Considered,
     Need,
     Phase,
     RunAccepted,
@@ -16,10 +18,12 @@ from appliance.model import (
     RunEventKind,
     RunRequest,
     TaskState,
+    Way,
     encode,
 )
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk
+from appliance.tasks.checkpoints import read_checkpoint
 from appliance.tasks.executor import Executor
 from appliance.tasks.remote import RemoteContainers
 
@@ -45,7 +49,9 @@ async def finish(pool: Any, run_id: str = "t-1/s1/1", **fields: Any) -> None:
             await asyncio.sleep(0.001)
     task, subtask, attempt = run_id.split("/")
     pool.runs[run_id].set_result(
-        RunEvent(task=task, subtask=subtask, attempt=int(attempt), kind=RunEventKind.SUCCEEDED, **fields)
+        RunEvent(
+            **{"task": task, "subtask": subtask, "attempt": int(attempt), "kind": RunEventKind.SUCCEEDED, **fields}
+        )
     )
 
 
@@ -201,3 +207,110 @@ async def test_a_restart_tells_of_lost_runs_and_skips_what_it_cannot_read(
     assert status.last.failure.retryable
     assert "run/t-1/s2/1" not in plane.store.values
     assert msgspec.json.decode(plane.store.values["run/t-1/s1/1"], type=RunEvent).kind is RunEventKind.FAILED
+
+
+def away(gateway: str) -> Decision:
+    """A decision for a container elsewhere, with what was considered."""
+    considered = (
+        Considered(gateway=gateway, container=f"c-{gateway}", way=Way.RUN_THERE, taken=True, verdict="taken"),
+    )
+    choice = Choice(
+        phase=Phase.REMOTE_WARM, way=Way.RUN_THERE, by="gw-1", gateway=gateway, considered=considered, why="warm there"
+    )
+    return Decision(
+        phase=Phase.REMOTE_WARM, gateway=gateway, container=f"c-{gateway}", way=Way.RUN_THERE, why="warm there",
+        choice=choice,
+    )  # fmt: skip
+
+
+HERE = Decision(
+    phase=Phase.COLD, gateway="gw-1", way=Way.NEW, why="a new one",
+    choice=Choice(phase=Phase.COLD, way=Way.NEW, by="gw-1", gateway="gw-1", why="a new one"),
+)  # fmt: skip
+
+
+async def test_a_container_that_is_not_there_is_counted_and_the_next_candidate_taken(
+    executor: Executor, plane: Any, pool: Any
+) -> None:
+    """A stale offer costs one message; the choice names the gateway that had none, and the next one serves."""
+
+    async def take(gateway: str, request: RunRequest) -> RunAccepted:
+        if gateway == "gw-2":
+            raise RefusedError("gw-2 has no ready container of base any more")
+        return RunAccepted(gateway=gateway, container="other", phase=Phase.REMOTE_WARM)
+
+    plane.rpc.on["run"] = take
+    pool.decisions = [away("gw-2"), away("gw-3")]
+    accepted = await executor.run(REQUEST)
+    assert (accepted.gateway, accepted.container) == ("gw-3", "other")
+    assert plane.session.refused == {"stale offer": 1}
+    assert accepted.choice is not None
+    assert accepted.choice.container == "other"
+    verdicts = {each.gateway: each.verdict for each in accepted.choice.considered}
+    assert verdicts["gw-2"].startswith("had none when asked: gw-2 has no ready container")
+    assert pool.asked[1][2].keys() == {"gw-2"}
+
+
+async def test_liars_all_around_end_in_a_cold_start_here(executor: Executor, plane: Any, pool: Any) -> None:
+    """After three candidates that were nothing, what is here has to do, and the record says whom it tried."""
+
+    async def none(gateway: str, request: RunRequest) -> RunAccepted:
+        raise NotFoundError("no such thing")
+
+    plane.rpc.on["run"] = none
+    pool.decisions = [away("gw-2"), away("gw-3"), away("gw-4"), HERE]
+    accepted = await executor.run(REQUEST)
+    assert (accepted.gateway, accepted.phase) == ("gw-1", Phase.COLD)
+    assert plane.session.refused == {"stale offer": 3}
+    assert [allowed for allowed, _, _ in pool.asked] == [True, True, True, False]
+    assert accepted.choice is not None
+    assert [each.gateway for each in accepted.choice.considered] == ["gw-2", "gw-3", "gw-4"]
+
+
+async def test_a_gateway_whose_offers_are_nothing_again_and_again_is_left_out(
+    executor: Executor, plane: Any, pool: Any
+) -> None:
+    """Three in a row, and it is not asked for a while; a good one in between begins anew."""
+    refuse = True
+
+    async def answer(gateway: str, request: RunRequest) -> RunAccepted:
+        if refuse:
+            raise RefusedError("none ready")
+        return RunAccepted(gateway=gateway, container="c", phase=Phase.REMOTE_WARM)
+
+    async def order(number: int, expected: str) -> None:
+        pool.decisions = [away("gw-2"), HERE]
+        assert (await executor.run(replace(REQUEST, subtask=f"s{number}"))).gateway == expected
+
+    plane.rpc.on["run"] = answer
+    await order(1, "gw-1")
+    await order(2, "gw-1")
+    refuse = False
+    await order(3, "gw-2")
+    refuse = True
+    for number in range(4, 7):
+        assert "gw-2" not in executor._remote.left_out()
+        await order(number, "gw-1")
+    assert "gw-2" in executor._remote.left_out()
+    pool.asked.clear()
+    pool.decisions = [HERE]
+    await executor.run(replace(REQUEST, subtask="s9"))
+    assert pool.asked[0][2] == {"gw-2": "its last 3 offers were nothing"}
+
+
+async def test_a_runs_checkpoints_are_kept_and_told_without_their_data(
+    executor: Executor, plane: Any, pool: Any
+) -> None:
+    """The event is small, the data lies beside the record, where the next attempt finds it."""
+    await executor.run(REQUEST)
+    async with asyncio.timeout(5):
+        while "t-1/s1/1" not in pool.tells:
+            await asyncio.sleep(0.001)
+    begun = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.CHECKPOINT, result={"at": 7})
+    pool.tells["t-1/s1/1"](begun)
+    await finish(pool, kind=RunEventKind.FAILED)
+    await last_event(plane)
+    told = plane.session.sent(plane.keys.run("t-1", "s1"), RunEvent)
+    kept = [each for each in told if each.kind is RunEventKind.CHECKPOINT]
+    assert [each.result for each in kept] == [None]
+    assert await read_checkpoint(plane.dht, "t-1", "s1") == {"at": 7}

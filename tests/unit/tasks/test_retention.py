@@ -78,3 +78,15 @@ def test_what_goes_is_older_than_what_stays(finished: list[tuple[int, str]], kee
     goes = [row for row in finished if row[1] in gone and gone.count(row[1]) == 1]
     if stays and goes and len({key for _, key in finished}) == len(finished):
         assert max(goes) < min(stays)
+
+
+async def test_checkpoints_of_ended_tasks_are_forgotten() -> None:
+    """A task that runs keeps its checkpoints; one that has ended, or is gone, has none."""
+    records = Records()
+    records.task("runs", TaskState.RUNNING, 0)
+    records.task("ended", TaskState.SUCCEEDED, 0)
+    for task in ("runs", "ended", "gone"):
+        records.put(f"checkpoint/{task}/s1")
+    plane = cast("Plane", SimpleNamespace(dht=records))
+    assert await Retention(plane, TasksConfig()).round() == 2
+    assert [key for key in records.kept if key.startswith("checkpoint/")] == ["checkpoint/runs/s1"]

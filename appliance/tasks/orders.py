@@ -1,0 +1,165 @@
+"""Sends what a driver has decided to the gateways: run orders, cancels, questions after runs; and keeps the answers.
+
+Orders go out only when the record that they follow from is written, each as a task of its own, so that a slow gateway
+holds up nobody. What comes of one is handed to the driver like any other news.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import structlog
+from msgspec.structs import replace
+
+from appliance.errors import SwiftbotError
+from appliance.model import (
+    Choice,
+    Failure,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
+    SubtaskRecord,
+    TaskRecord,
+)
+from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.surroundings import Input, RunNews, Surroundings, deadline_s, need_of
+
+log = structlog.get_logger(__name__)
+
+ANSWER_S = 0.25
+"""How long the end of a run waits for the answer to its order, which says how its container was chosen. It is on its
+way: a run that takes no time can be heard of before it."""
+
+
+def request_for(
+    record: TaskRecord, target: SubtaskRecord, manifest: SkillManifest, *, robot: str | None, coordinator: str
+) -> RunRequest:
+    """Return the order for the next attempt at a subtask."""
+    subtask = target.subtask
+    return RunRequest(
+        task=record.id,
+        subtask=subtask.id,
+        attempt=target.attempt + 1,
+        skill=subtask.skill,
+        need=need_of(manifest),
+        robot=robot,
+        params=subtask.params,
+        inputs=_inputs(record, target),
+        coordinator=coordinator,
+        deadline_s=deadline_s(manifest, subtask.params),
+    )
+
+
+def _inputs(record: TaskRecord, target: SubtaskRecord) -> dict[str, dict[str, Any]]:
+    """Results of the subtasks it comes after, directly or not: a report needs the picture two steps back."""
+    found: dict[str, dict[str, Any]] = {}
+    open_ids = list(target.subtask.after)
+    while open_ids:
+        before = record.of(open_ids.pop(0))
+        if before.subtask.id not in found:
+            found[before.subtask.id] = {"skill": before.subtask.skill, **(before.result or {})}
+            open_ids.extend(before.subtask.after)
+    return found
+
+
+class Orders:
+    """The orders of one task. `tell` gets what comes of them."""
+
+    def __init__(self, around: Surroundings, tell: Callable[[Input], None]) -> None:
+        self._around = around
+        self._tell = tell
+        self._outgoing: list[tuple[str, RunRequest]] = []
+        self._sending: dict[tuple[str, int], asyncio.Task[object]] = {}
+        self._tasks: set[asyncio.Task[object]] = set()
+        self._accepted: dict[tuple[str, int], RunAccepted] = {}
+        self._sent_at: dict[str, float] = {}
+
+    def add(self, gateway: str, request: RunRequest) -> None:
+        """Have an order ready for when the record is written."""
+        self._outgoing.append((gateway, request))
+
+    def go(self) -> None:
+        """The record is written: send what waited for that."""
+        outgoing, self._outgoing = self._outgoing, []
+        for gateway, request in outgoing:
+            self._sent_at[request.subtask] = time.monotonic()
+            self._sending[request.subtask, request.attempt] = self._start(self._send(gateway, request))
+
+    def sent_at(self, subtask: str) -> float:
+        """When the last order of a subtask went out; 0 for one that another coordinator sent."""
+        return self._sent_at.get(subtask, 0.0)
+
+    def silent_since(self, subtask: str, now: float) -> float:
+        """Since when a run is waited for: its order, or the first look at one that another coordinator sent."""
+        return self._sent_at.setdefault(subtask, now)
+
+    async def answered(self, subtask: str, attempt: int) -> None:
+        """Wait a moment for the answer to an order that is on its way."""
+        sending = self._sending.pop((subtask, attempt), None)
+        if sending is not None and not sending.done():
+            await asyncio.wait({sending}, timeout=ANSWER_S)
+
+    def choice(self, subtask: str, attempt: int) -> Choice | None:
+        """How the container of an attempt was chosen, as far as it is known by now."""
+        accepted = self._accepted.get((subtask, attempt))
+        return accepted.choice if accepted is not None else None
+
+    def cancel(self, target: SubtaskRecord, task: str) -> None:
+        """Have a run end; its final event follows."""
+        self._start(self.ask(target, task, "run_cancel"))
+
+    async def ask(self, target: SubtaskRecord, task: str, verb: str) -> RunStatus | None:
+        """Ask a run's gateway about it (`run_status`, `run_cancel`); None when it does not answer."""
+        ask = RunAsk(task=task, subtask=target.subtask.id, attempt=target.attempt)
+        try:
+            return await self._around.plane.rpc.call(target.gateway, verb, ask, RunStatus, timeout_s=2.0)
+        except SwiftbotError as error:
+            log.info("no word of a run", run=ask.run_id, gateway=target.gateway, reason=str(error))
+            return None
+
+    def close(self) -> None:
+        """Give up what is on its way."""
+        for task in self._tasks:
+            task.cancel()
+
+    async def _send(self, gateway: str, request: RunRequest) -> None:
+        try:
+            if request.attempt > 1:
+                request = replace(request, resume=await self._around.checkpoint(request.task, request.subtask))
+            accepted = await self._around.order(gateway, request)
+            self._accepted[request.subtask, request.attempt] = accepted
+            if accepted.gateway != gateway:
+                # Passed on to a warm container: from now on that gateway answers for the run.
+                self._tell(RunNews(_event(request, accepted.gateway, RunEventKind.PROGRESS)))
+        except SwiftbotError as error:
+            failure = Failure(
+                code=error.code if error.code in ("refused", "pool") else "unreachable",
+                message=f"{gateway}: {error.message}",
+                remedy=error.remedy,
+                retryable=True,
+            )
+            self._tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
+        except Exception as error:  # the boundary to the executor here: the attempt fails, the task goes on
+            log.exception("run order broke", run=request.run_id, gateway=gateway)
+            failure = Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
+            self._tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
+
+    def _start(self, order: Coroutine[Any, Any, object]) -> asyncio.Task[object]:
+        task = asyncio.create_task(order)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+
+def _event(request: RunRequest, gateway: str, kind: RunEventKind, failure: Failure | None = None) -> RunEvent:
+    return RunEvent(
+        task=request.task,
+        subtask=request.subtask,
+        attempt=request.attempt,
+        kind=kind,
+        gateway=gateway,
+        failure=failure,
+    )

@@ -1,0 +1,172 @@
+"""Checkpoints of runs: kept beside the record, the newest only, fenced by attempt, bounded."""
+
+import asyncio
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.errors import UnreachableError
+from appliance.model import RunEvent, RunEventKind, encode
+from appliance.tasks import checkpoints as module
+from appliance.tasks.checkpoints import (
+    Checkpoint,
+    Checkpoints,
+    checkpoint_key,
+    read_checkpoint,
+    remove_checkpoint,
+    stronger,
+)
+
+pytestmark = pytest.mark.anyio
+
+KEY = checkpoint_key("t-1", "s1")
+
+
+class Told:
+    """What the checkpoints of a gateway tell and refuse."""
+
+    def __init__(self, dht: Any, *, max_bytes: int = 1000) -> None:
+        self.dht = dht
+        self.events: list[RunEvent] = []
+        self.refused: list[str] = []
+        self.checkpoints = Checkpoints(
+            dht,
+            gateway="gw-1",
+            max_bytes=max_bytes,
+            tell=self.events.append,
+            refuse=lambda what, reason: self.refused.append(f"{what}: {reason}"),
+        )
+
+    def add(self, data: dict[str, Any], attempt: int = 1) -> None:
+        """Have a run save something."""
+        self.checkpoints.add(event(RunEventKind.CHECKPOINT, attempt=attempt, result=data))
+
+    async def end(self, kind: RunEventKind, attempt: int = 1) -> None:
+        """End a run."""
+        await self.checkpoints.end(event(kind, attempt=attempt))
+
+    async def kept(self) -> int:
+        """Wait until something is kept; returns how often."""
+        async with asyncio.timeout(5):
+            while not self.events:
+                await asyncio.sleep(0.001)
+        return len(self.events)
+
+
+def event(kind: RunEventKind, *, attempt: int = 1, **fields: Any) -> RunEvent:
+    """Return an event of a run."""
+    return RunEvent(task="t-1", subtask="s1", attempt=attempt, kind=kind, **fields)
+
+
+@pytest.fixture
+def told(plane: Any) -> Told:
+    """Return the checkpoints of a gateway on fakes."""
+    return Told(plane.dht)
+
+
+async def test_the_last_checkpoint_of_a_failed_run_is_what_the_next_attempt_gets(told: Told) -> None:
+    """The first is written at once, those that follow within a second are one write at the end: the newest."""
+    told.add({"at": 1})
+    await told.kept()
+    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 1}
+    for number in range(2, 50):
+        told.add({"at": number})
+    await told.end(RunEventKind.FAILED)
+    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 49}
+    assert told.dht.writes == 2
+    assert [each.kind for each in told.events] == [RunEventKind.CHECKPOINT] * 2
+    assert all(each.result is None and "kept" in each.note for each in told.events)
+
+
+async def test_writes_of_a_run_are_a_second_apart(told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What comes meanwhile waits and is written without another one coming."""
+    monkeypatch.setattr(module, "EVERY_S", 0.05)
+    told.add({"at": 1})
+    await told.kept()
+    told.add({"at": 2})
+    async with asyncio.timeout(5):
+        while await read_checkpoint(told.dht, "t-1", "s1") != {"at": 2}:
+            await asyncio.sleep(0.005)
+    await told.end(RunEventKind.SUCCEEDED)
+
+
+async def test_an_outdated_run_does_not_replace_a_newer_ones(told: Told) -> None:
+    """The attempt fences; a later attempt does replace an earlier one's."""
+    told.add({"of": 2}, attempt=2)
+    await told.end(RunEventKind.FAILED, attempt=2)
+    told.add({"of": 1}, attempt=1)
+    await told.end(RunEventKind.FAILED, attempt=1)
+    assert await read_checkpoint(told.dht, "t-1", "s1") == {"of": 2}
+    told.add({"of": 3}, attempt=3)
+    await told.end(RunEventKind.FAILED, attempt=3)
+    assert await read_checkpoint(told.dht, "t-1", "s1") == {"of": 3}
+
+
+@pytest.mark.parametrize("data", [{"x": "y" * 2000}, {"x": "\ud800"}, "deep"])
+async def test_what_cannot_be_kept_is_refused_and_the_last_one_stands(told: Told, data: Any) -> None:
+    """Oversize, not JSON, nested without end: counted, and told as a line of the run's log."""
+    told.add({"at": 1})
+    await told.kept()
+    if data == "deep":
+        data = {}
+        for _ in range(5000):
+            data = {"a": data}
+    told.add(data)
+    assert len(told.refused) == 1
+    assert told.events[-1].kind is RunEventKind.LOG
+    assert "the last one before it stands" in told.events[-1].note
+    await told.end(RunEventKind.FAILED)
+    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 1}
+
+
+async def test_a_plane_that_fails_costs_the_checkpoint_only(told: Told) -> None:
+    """A write that does not work is tried again with the next one; a read that does not work is no checkpoint."""
+    told.dht.break_next = [UnreachableError("no owner")]
+    told.add({"at": 1})
+    await told.end(RunEventKind.FAILED)
+    assert await read_checkpoint(told.dht, "t-1", "s1") is None
+    told.add({"at": 2}, attempt=2)
+    await told.end(RunEventKind.FAILED, attempt=2)
+    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 2}
+
+    async def away(key: str) -> None:
+        raise UnreachableError("nobody answers")
+
+    told.dht.read = away
+    assert await read_checkpoint(told.dht, "t-1", "s1") is None
+    await remove_checkpoint(told.dht, "t-1", "s1")
+
+
+async def test_removed_is_gone(told: Told) -> None:
+    """After the task's end nothing is left; removing what is not there does no harm."""
+    told.add({"at": 1})
+    await told.end(RunEventKind.FAILED)
+    await remove_checkpoint(told.dht, "t-1", "s1")
+    await remove_checkpoint(told.dht, "t-1", "s1")
+    assert KEY not in told.dht.records
+
+
+versions = st.one_of(
+    st.binary(max_size=20),
+    st.builds(
+        lambda attempt, at: encode(Checkpoint(attempt=attempt, gateway="g", at_ns=at, data={})),
+        st.integers(1, 20),
+        st.integers(0, 10),
+    ),
+)
+
+
+@given(versions, versions, versions)
+def test_concurrent_checkpoints_settle_alike_everywhere(one: bytes, two: bytes, three: bytes) -> None:
+    """Commutative and associative; a later attempt's wins."""
+    assert stronger(one, two) == stronger(two, one)
+    assert stronger(stronger(one, two), three) == stronger(one, stronger(two, three))
+    try:
+        found = [msgspec.json.decode(each, type=Checkpoint) for each in (one, two)]
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return
+    winner = msgspec.json.decode(stronger(one, two), type=Checkpoint)
+    assert winner.attempt == max(each.attempt for each in found)
