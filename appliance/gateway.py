@@ -259,7 +259,7 @@ class Gateway:
             tasks=self.manager.unfinished,
             draining=self._draining,
             limits_enforced=self.pool.limits_enforced,
-            pool_problem=self.pool.problem,
+            pool_problem=self.pool.problem or self.pool.squeeze,
             robots=self.hub.attached,
             endpoints=self.config.plane.listen,
             refused=dict(counters),

@@ -20,6 +20,7 @@ SECTIONS = (
     ("plane", "appliance.plane.settings", "PlaneConfig"),
     ("pool", "appliance.pool.settings", "PoolConfig"),
     ("pool.weights", "appliance.pool.settings", "Weights"),
+    ("pool.pressure", "appliance.pool.settings", "PressureConfig"),
     ("llm", "appliance.llm.settings", "LlmConfig"),
     ("robots", "appliance.robots.settings", "RobotsConfig"),
     ("robots.mavlink", "appliance.robots.settings", "MavlinkLink"),

@@ -24,6 +24,7 @@ from appliance.pool.decisions import Decisions
 from appliance.pool.engine import LABEL_ID, Engine, EngineFacts
 from appliance.pool.link import EngineLink
 from appliance.pool.policies import ColdCosts, Idle, Planner, Quarantine, Retire, View
+from appliance.pool.pressure import MemoryWatch, Reading
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 
@@ -50,6 +51,7 @@ class Keeper:
         make_engine: makes the connection to Podman.
         on_change: told the facts of all containers after something changed.
         refused: counts what is declined.
+        read_memory: what the kernel says of memory, unless a test says otherwise.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Keeper:
         make_engine: Callable[[], Engine],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         refused: Counter[str],
+        read_memory: Callable[[], Reading] | None = None,
     ) -> None:
         self.costs = ColdCosts(config.cold_ms)
         self.decisions = Decisions()
@@ -71,9 +74,17 @@ class Keeper:
         self._gateway = gateway
         self._images = tuple(images)
         self._refused = refused
+        self._wake = asyncio.Event()
         self._starter = make_starter(lambda container: self.retire(container, "it died"))
         self._planner = Planner(config, self.costs, lambda image: self._starter.size(image).memory_mb)
         self._quarantine = Quarantine(after=config.bad_starts, for_s=config.quarantine_s)
+        self._memory = MemoryWatch(
+            config.pressure,
+            memory_mb=config.memory_mb,
+            held_mb=lambda: self.books.memory_mb,
+            on_change=self._wake.set,
+            read=read_memory,
+        )
         self._starts: dict[str, asyncio.Task[SwiftbotError | None]] = {}
         self._background: set[asyncio.Task[None]] = set()
         self._next_sweep = 0.0
@@ -81,8 +92,7 @@ class Keeper:
         """Nothing new is begun here: no run, no hint, no warming."""
         self._adopted = False
         self._stopped = False
-        self._wake = asyncio.Event()
-        self._tender: asyncio.Task[None] | None = None
+        self._standing: list[asyncio.Task[None]] = []
 
     # --- what is --------------------------------------------------------------------------------------------
 
@@ -90,6 +100,12 @@ class Keeper:
     def problem(self) -> str:
         """Why containers, or those of some image, cannot be started now; empty when they can."""
         return self.link.problem or "; ".join(self._quarantine.reasons(time.monotonic()))
+
+    @property
+    def squeeze(self) -> str:
+        """Why the pool holds less than it is allowed, when the machine is short of memory; empty otherwise."""
+        squeeze = self._memory.squeeze
+        return squeeze.reason and f"{squeeze.reason}: {squeeze.budget_mb} of {self._config.memory_mb} MB for containers"
 
     def check_startable(self, need: Need) -> None:
         """Raise when a cold start now would be in vain.
@@ -102,7 +118,8 @@ class Keeper:
         if self.books.queue >= self._config.queue and self._room(self._size_mb(need), for_run=True) is None:
             self._refused["queue full"] += 1
             raise RefusedError(
-                f"all {len(self.books)} containers of {self._gateway} are busy and {self.books.queue} runs wait",
+                f"all {len(self.books)} containers of {self._gateway} are busy and {self.books.queue} runs wait"
+                + (f"; {self.squeeze}" if self.squeeze else ""),
                 remedy="wait, or raise pool.capacity",
             )
 
@@ -124,8 +141,9 @@ class Keeper:
         holders = Counter(f"{each.info.state} {each.info.image}" for each in self.books)
         return (
             f"no room for one more {image} container ({size_mb} MB): {len(self.books)} of {self._config.capacity}"
-            f" places and {self.books.memory_mb} of {self._config.memory_mb} MB are taken by "
+            f" places and {self.books.memory_mb} of {self._memory.squeeze.budget_mb} MB are taken by "
             + ", ".join(f"{count} {what}" for what, count in sorted(holders.items()))
+            + (f"; {self.squeeze}" if self.squeeze else "")
         )
 
     # --- what others ask --------------------------------------------------------------------------------------
@@ -164,14 +182,15 @@ class Keeper:
     async def start(self) -> None:
         """Connect to Podman and adopt what is there; whatever is missing then is worked on in the background."""
         await self.link.start(CONNECT_WAIT_S)
-        self._tender = asyncio.create_task(self._tend_forever(), name="tend the pool")
+        for work in (self._tend_forever(), self._memory.run()):
+            self._standing.append(asyncio.create_task(work, name=work.__qualname__))
 
     async def stop(self, *, keep_containers: bool, patience_s: float) -> None:
         """Let go of everything; containers go on running, to be adopted, if they are to be kept."""
         self._stopped = True
         self.books.send_away()
-        if self._tender is not None:
-            self._tender.cancel()
+        for task in self._standing:
+            task.cancel()
         self.link.cancel()
         # Starts are let come to their end: one cut off between two steps would leave a container nobody knows.
         until = time.monotonic() + patience_s
@@ -196,8 +215,8 @@ class Keeper:
         await self.link.close()
 
     def _unfinished(self) -> list[asyncio.Task[Any]]:
-        tender = [self._tender] if self._tender is not None and not self._tender.done() else []
-        return [*tender, *self.link.unfinished, *self._starts.values(), *self._background]
+        standing = [task for task in self._standing if not task.done()]
+        return [*standing, *self.link.unfinished, *self._starts.values(), *self._background]
 
     def spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
         """Run something in the background that `stop` waits for."""
@@ -240,7 +259,7 @@ class Keeper:
             starting=starting,
             memory_mb=self.books.memory_mb,
             containers=len(self.books),
-            budget_mb=self._config.memory_mb,
+            budget_mb=self._memory.squeeze.budget_mb,
             capacity=self._config.capacity,
             blocked=frozenset(image for image in self._images if self._quarantine.reason(image, now)),
         )

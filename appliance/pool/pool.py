@@ -26,6 +26,7 @@ from appliance.pool.container import PooledContainer
 from appliance.pool.conversation import Call
 from appliance.pool.engine import Engine, PodmanEngine
 from appliance.pool.keeper import Keeper
+from appliance.pool.pressure import Reading
 from appliance.pool.running import Runs
 from appliance.pool.selection import Candidate, Decision, Facts, select
 from appliance.pool.settings import PoolConfig
@@ -53,6 +54,7 @@ class Pool:
         on_call: carries out what a handler asks of the appliance.
         on_change: told the facts of all containers whenever one of them changes.
         make_engine: Podman, unless a test says otherwise.
+        read_memory: what the kernel says of memory, unless a test says otherwise.
 
     Raises:
         ConfigError: the floor names an image that is not there.
@@ -72,6 +74,7 @@ class Pool:
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         make_engine: Callable[[], Engine] | None = None,
+        read_memory: Callable[[], Reading] | None = None,
     ) -> None:
         known = ", ".join(sorted(catalogue.images))
         for image in config.floor:
@@ -97,6 +100,7 @@ class Pool:
             make_engine=make_engine or (lambda: PodmanEngine(config.podman_url)),
             on_change=on_change,
             refused=self.refused,
+            read_memory=read_memory,
         )
         self._runs = Runs(
             config,
@@ -114,6 +118,11 @@ class Pool:
     def problem(self) -> str:
         """Why containers, or those of some image, cannot be started now; empty when they can."""
         return self._keeper.problem
+
+    @property
+    def squeeze(self) -> str:
+        """Why the pool holds less than it is allowed, when the machine is short of memory; empty otherwise."""
+        return self._keeper.squeeze
 
     @property
     def limits_enforced(self) -> bool:

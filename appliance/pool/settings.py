@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct, field
 
 Positive = Annotated[float, Meta(gt=0)]
+Percent = Annotated[float, Meta(gt=0, le=100)]
 
 
 class Weights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -14,6 +15,33 @@ class Weights(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The right image matters most: a merely compatible one has not preloaded this skill."""
     resources: float = 0.3
     volumes: float = 0.2
+
+
+class PressureConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When the pool gives way to a lack of memory."""
+
+    watch: bool = True
+    """Whether it does at all."""
+    every_s: Positive = 1.0
+    """How often the kernel is asked: reading three small files takes 0.1 ms."""
+    some_high: Percent = 10.0
+    """Percent of the last 10 s in which some process stood still for want of memory, from which the pool shrinks."""
+    full_high: Percent = 5.0
+    """The same for all processes at once."""
+    low: Annotated[float, Meta(ge=0, le=100)] = 2.0
+    """Percent of `some` below which it may grow again."""
+    spare_mb: Annotated[int, Meta(ge=0)] = 256
+    """Available memory below which the pool shrinks, MB; it grows again from one and a half times as much."""
+    shrink: Annotated[float, Meta(gt=0, le=1)] = 0.25
+    """Part of what is held that is taken away at once."""
+    settle_s: Positive = 3.0
+    """How long a step is given to show before the next."""
+    calm_s: Positive = 20.0
+    """How long it must be calm before the pool may grow by a step."""
+    regrow: Annotated[float, Meta(gt=0, le=1)] = 0.125
+    """Part of `pool.memory_mb` by which it grows."""
+    least_mb: Annotated[int, Meta(ge=0)] = 512
+    """What the pool may always hold: two ordinary containers, so that work goes on however slowly."""
 
 
 class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -100,3 +128,4 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """For how long."""
     reconnect_s: Positive = 1.0
     """First pause before a Podman that is not there is tried again; doubles up to 30 s."""
+    pressure: PressureConfig = field(default_factory=PressureConfig)

@@ -24,6 +24,7 @@ from appliance.errors import PoolError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, Need, RunEvent, RunRequest, Site
 from appliance.pool.engine import ContainerSpec, EngineFacts, Found, FoundImage
 from appliance.pool.pool import Call, Pool
+from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import RUNNER
@@ -302,6 +303,7 @@ class Bench:
         self.changes: list[tuple[ContainerInfo, ...]] = []
         self.calls: list[Call] = []
         self.offers: list[Candidate] = []
+        self.memory = Reading()
 
     async def answer(self, call: Call) -> dict[str, Any]:
         """Carry out a handler's call."""
@@ -336,6 +338,7 @@ class Bench:
             on_call=self.answer,
             on_change=self.changes.append,
             make_engine=lambda: self.engine,
+            read_memory=lambda: self.memory,
         )
         self.pools.append(pool)
         await pool.start()

@@ -10,7 +10,9 @@ import pytest
 
 from appliance.errors import ConfigError, NotFoundError, PoolError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need, Phase, RunEventKind
+from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate, Decision
+from appliance.pool.settings import PressureConfig
 
 pytestmark = pytest.mark.anyio
 
@@ -270,6 +272,23 @@ async def test_idle_ones_beyond_the_floor_go(bench: Any) -> None:
     await bench.ready(pool, 1)
     await asyncio.gather(*(bench.run(pool, bench.request(number)) for number in range(3)))
     await bench.until(lambda: len(pool.containers()) == 1, "back to the floor")
+
+
+async def test_memory_pressure(bench: Any) -> None:
+    """A machine short of memory: idle containers go until the budget holds, the pool says why, and it grows back."""
+    marks = {"every_s": 0.02, "settle_s": 0.05, "calm_s": 0.1, "least_mb": 256}
+    pool = await bench.pool(floor={"base": 3}, memory_mb=1024, pressure=PressureConfig(**marks))
+    await bench.ready(pool, 3)
+    bench.memory = Reading(available_mb=10.0, some=40.0)
+    await bench.until(lambda: len(pool.containers()) == 1, "all but what is always allowed are given up")
+    await bench.until(lambda: "256 of 1024 MB" in pool.squeeze, "the least that is always allowed")
+    assert "40 % of the last 10 s" in pool.squeeze
+    assert pool.problem == ""
+    final, _ = await bench.run(pool, bench.request(1))
+    assert final.kind is RunEventKind.SUCCEEDED
+    bench.memory = Reading(available_mb=1000.0, some=0.0)
+    await bench.ready(pool, 3)
+    await bench.until(lambda: pool.squeeze == "", "all is well again")
 
 
 async def test_podman_absent(bench: Any) -> None:
