@@ -39,6 +39,10 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """`udp://host:port` or `tcp://host:port` to listen on. With neither `listen` nor `connect`: udp://127.0.0.1:14550."""
     connect: str = ""
     """The same to connect to, again and again while nobody is there: a vehicle, SITL or a router that listens."""
+    signing: str = ""
+    """File with the link's MAVLink 2 signing key, readable by this user alone: a passphrase, or `hex:` and 64 digits;
+    `credential:NAME` for one that systemd hands over. Set, every frame sent is signed and frames that are unsigned,
+    wrongly signed or replayed are refused. Empty: no signing, and signed frames are refused."""
     names: dict[str, str] = field(default_factory=dict[str, str])
     prefix: str = "drone_"
     """Name of a vehicle not in `names`: prefix and system id. Empty: such vehicles are refused."""

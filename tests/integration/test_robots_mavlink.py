@@ -31,6 +31,11 @@ asyncio.run(run_vehicle(msgspec.json.decode(sys.argv[1], type=VehicleSettings)))
 """
 
 
+async def start_vehicle(order: VehicleSettings) -> asyncio.subprocess.Process:
+    """Start a simulated vehicle as a process of its own."""
+    return await asyncio.create_subprocess_exec(sys.executable, "-c", _PROCESS, msgspec.json.encode(order).decode())
+
+
 class Yard:
     """A hub on one session, a client on another, and what the client saw."""
 
@@ -56,9 +61,7 @@ class Yard:
         """Start a vehicle and wait until the roster has it online."""
         usual = {"to": f"udp://127.0.0.1:{self.port}", "site": SITE, "rate": 8.0}
         order = VehicleSettings(**(usual | settings))
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", _PROCESS, msgspec.json.encode(order).decode()
-        )
+        process = await start_vehicle(order)
         self.processes.append(process)
         self.infos.clear()
         await until(lambda: any(each.online and each.pose for each in self.infos))
@@ -154,6 +157,22 @@ async def test_a_vehicle_that_listens(open_yard: Open, free_ports: Callable[[int
     await until(lambda: not yard.infos[-1].online)
     await yard.vehicle(to=url, listen=True)
     assert (await yard.done("state"))["armed"] is False
+
+
+async def test_a_signed_link(open_yard: Open, free_udp_port: int, tmp_path: Path) -> None:
+    """A vehicle with the key flies; one without it, and one with another key, is not even seen, and is counted."""
+    keys = [tmp_path / name for name in ("key", "other")]
+    for key in keys:
+        key.write_text(f"secret {key.name}")
+        key.chmod(0o600)
+    url = f"udp://127.0.0.1:{free_udp_port}"
+    yard = await open_yard(link=MavlinkLink(listen=url, prefix="drone_", signing=str(keys[0])))
+    yard.processes.append(await start_vehicle(VehicleSettings(to=url, system=2, site=SITE)))
+    yard.processes.append(await start_vehicle(VehicleSettings(to=url, system=3, site=SITE, signing=str(keys[1]))))
+    await until(lambda: {"unsigned", "bad_signature"} <= yard.hub.refused.keys())
+    await yard.vehicle(signing=str(keys[0]))
+    assert (await yard.done("takeoff", altitude_m=6.0))["altitude_m"] == pytest.approx(6.0, abs=0.6)
+    assert yard.hub.attached == ("drone_1",)
 
 
 async def test_goto_from_the_ground_and_home_again(open_yard: Open) -> None:

@@ -6,16 +6,17 @@ pymavlink's stream parser is not used: it resynchronises across datagrams and hi
 must count each damaged frame and keep the raw bytes of each good one. Its decoder and encoder are.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 from msgspec import Struct
 from pymavlink.dialects.v20 import ardupilotmega as _dialect
 
+from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG, Signer, wall_ticks
+
 MARKER_V2 = 0xFD
 MARKER_V1 = 0xFE
-_SIGNED = 0x01
-_HEADER_V2, _HEADER_V1, _CHECKSUM, _SIGNATURE = 10, 6, 2, 13
+_HEADER_V2, _HEADER_V1, _CHECKSUM = 10, 6, 2
 
 Message = Any
 """A pymavlink message: fields by name."""
@@ -33,25 +34,47 @@ class Frame(Struct, frozen=True, kw_only=True):
 
 
 class Damage(Struct, frozen=True):
-    """Bytes that made no frame: `checksum`, `unknown_message`, `signed`, `truncated`, `incompatible`, `noise`."""
+    """Bytes that made no frame, or one that is not believed.
+
+    `checksum`, `unknown_message`, `truncated`, `incompatible`, `noise`; `signed` (there is no key here), `unsigned`,
+    `bad_signature`, `replayed`.
+    """
 
     kind: str
     length: int
 
 
 class Codec:
-    """Decoder and encoder of one link. `system` and `component` are what it sends as."""
+    """Decoder and encoder of one link. `system` and `component` are what it sends as.
 
-    def __init__(self, system: int, component: int) -> None:
+    With a `signer` every frame sent is signed and every frame read must be; without one signed frames are refused.
+    """
+
+    def __init__(
+        self, system: int, component: int, *, signer: Signer | None = None, clock: Callable[[], int] = wall_ticks
+    ) -> None:
         self._mav: Any = _dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self.system = system
         self.component = component
+        self.signer = signer
+        self._clock = clock
 
     def pack(self, message: Message) -> bytes:
         """Encode a message as a MAVLink 2 frame with the next sequence number."""
         raw = bytes(message.pack(self._mav))
+        if self.signer is not None:
+            raw = self._sign(raw, message)
         self._mav.seq = (self._mav.seq + 1) % 256
         return raw
+
+    def _sign(self, raw: bytes, message: Message) -> bytes:
+        """Sign a frame: its header must say so, and the checksum covers the header."""
+        assert self.signer is not None  # noqa: S101 - only called with one
+        body = bytearray(raw[:-_CHECKSUM])
+        body[2] |= SIGNED_FLAG
+        checksum = _dialect.x25crc(bytes(body[1:]) + bytes([message.crc_extra])).crc
+        frame = bytes(body) + checksum.to_bytes(2, "little")
+        return frame + self.signer.signature(frame, self.signer.stamp(self._clock()))
 
     def read(self, data: bytes, *, more: bool = False) -> Generator[Frame | Damage, None, int]:
         """Yield what a datagram (or a piece of a log or stream) holds, in order; never raises.
@@ -104,7 +127,7 @@ class Codec:
         return behind if behind == len(data) or data[behind] in (MARKER_V1, MARKER_V2) else inner
 
     def _decode(self, raw: bytes) -> Frame | Damage:
-        if raw[0] == MARKER_V2 and raw[2] & ~_SIGNED:
+        if raw[0] == MARKER_V2 and raw[2] & ~SIGNED_FLAG:
             return Damage("incompatible", len(raw))
         try:
             message: Message = self._mav.decode(bytearray(raw))
@@ -112,10 +135,9 @@ class Codec:
             return Damage("checksum", len(raw))
         if isinstance(message, _dialect.MAVLink_unknown):
             return Damage("unknown_message", len(raw))
-        if raw[0] == MARKER_V2 and raw[2] & _SIGNED:
-            # No key is shared with vehicles, so a signature proves nothing here and may be of another's making.
-            return Damage("signed", len(raw))
-        header = message.get_header()
+        header: Any = message.get_header()
+        if problem := self._unproven(raw, header.srcSystem, header.srcComponent, message):
+            return Damage(problem, len(raw))
         return Frame(
             system=header.srcSystem,
             component=header.srcComponent,
@@ -124,6 +146,15 @@ class Codec:
             message=message,
             raw=raw,
         )
+
+    def _unproven(self, raw: bytes, system: int, component: int, message: Message) -> str:
+        """Return why a frame whose checksum is right is not believed; empty when it is."""
+        if self.signer is None:
+            # No key is shared with this link's vehicles: a signature proves nothing and may be of another's making.
+            return "signed" if raw[0] == MARKER_V2 and raw[2] & SIGNED_FLAG else ""
+        problem = self.signer.problem(raw, system=system, component=component, now=self._clock())
+        # A radio's own account of the link is made by the radio, which has no key (guide: Message Signing).
+        return "" if problem == "unsigned" and message.get_type() == "RADIO_STATUS" else problem
 
 
 class Stream:
@@ -151,7 +182,7 @@ def frame_length(data: bytes, at: int) -> int | None:
         return None
     if data[at] == MARKER_V1:
         return _HEADER_V1 + data[at + 1] + _CHECKSUM
-    return _HEADER_V2 + data[at + 1] + _CHECKSUM + (_SIGNATURE if data[at + 2] & _SIGNED else 0)
+    return _HEADER_V2 + data[at + 1] + _CHECKSUM + (SIGNATURE_BYTES if data[at + 2] & SIGNED_FLAG else 0)
 
 
 def _next_marker(data: bytes, start: int) -> int:

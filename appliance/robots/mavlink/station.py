@@ -10,6 +10,7 @@ import contextlib
 from collections import Counter
 from collections.abc import Callable
 
+import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
@@ -21,6 +22,7 @@ from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.copter import Copter
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Address, Link, open_link
+from appliance.robots.mavlink.signing import Memory, Signer, read_key
 from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 
@@ -32,6 +34,13 @@ _OFFLINE_INFO_S = 5.0
 """How often the roster is reminded of a vehicle that is offline."""
 _STREAMS_HZ = {"GLOBAL_POSITION_INT": 5.0, "SYS_STATUS": 1.0, "MISSION_CURRENT": 2.0, "HOME_POSITION": 0.2}
 """What is asked of a vehicle that has come online; ArduPilot sends little of it by itself."""
+
+_REMEMBER_S = 5.0
+"""How often the times of signed links are kept; what a crash forgets may be replayed within a minute."""
+
+
+def _signing_key(link: MavlinkLink) -> str:
+    return f"mavlink/signing/{link.remote}"
 
 
 class _Attached:
@@ -86,7 +95,8 @@ class Station:
         """Bind the ports and begin; ConfigError with the remedy when a port is taken."""
         try:
             for index, link in enumerate(self._config.mavlink):
-                codec = Codec(self._config.system_id, self._config.component_id)
+                signer = await self._signer(index, link)
+                codec = Codec(self._config.system_id, self._config.component_id, signer=signer)
                 self._links.append(await open_link(link.remote, codec, self._receiver(index, link), self.refused))
                 log.info("MAVLink link open", link=str(link.remote), listens=link.remote.listens)
         except SwiftbotError:
@@ -94,6 +104,26 @@ class Station:
             raise
         self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
         self._ticking = asyncio.create_task(self._tick(), name="robot hub")
+
+    async def _signer(self, index: int, link: MavlinkLink) -> Signer | None:
+        """Return the key of a link with what it knew before, so that nothing old is believed after a restart."""
+        if not link.signing:
+            return None
+        key = await asyncio.to_thread(read_key, link.signing)
+        name = _signing_key(link)
+        kept = dict(await self._store.scan(name)).get(name)
+        try:
+            memory = msgspec.json.decode(kept, type=Memory) if kept else Memory()
+        except msgspec.DecodeError as error:
+            log.warning("what a signed link knew is lost", link=str(link.remote), reason=str(error))
+            memory = Memory()
+        return Signer(key, link_id=index % 256, memory=memory)
+
+    async def _remember(self) -> None:
+        """Keep the times of signed links."""
+        for link, settings in zip(self._links, self._config.mavlink, strict=False):
+            if link.codec.signer is not None:
+                await self._store.put(_signing_key(settings), encode(link.codec.signer.memory))
 
     async def stop(self) -> None:
         """End commands (they are resumed by the next process), take back what was declared, close the ports."""
@@ -115,6 +145,7 @@ class Station:
         self._by_source.clear()
         for link in self._links:
             await link.close()
+        await self._remember()
         self._links.clear()
         if self._watch is not None:
             self._watch.close()
@@ -260,9 +291,13 @@ class Station:
     async def _tick(self) -> None:
         """Send heartbeats, notice lost ones, tell the roster."""
         loop = asyncio.get_running_loop()
-        beat_at = 0.0
+        beat_at, remember_at = 0.0, loop.time() + _REMEMBER_S
         while True:
             now = loop.time()
+            if now >= remember_at:
+                remember_at = now + _REMEMBER_S
+                with contextlib.suppress(SwiftbotError):  # a disk that is full now may not be so the next time
+                    await self._remember()
             if now >= beat_at:
                 beat_at = now + self._config.heartbeat_s
                 self._beat()

@@ -16,6 +16,7 @@ from appliance.model import Site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Link, open_link
+from appliance.robots.mavlink.signing import Signer, read_key
 from appliance.robots.settings import MAX_SYSTEM, Remote, read_remote
 from appliance.robots.sim.copter import STREAMS_HZ, SimCopter
 from appliance.robots.sim.telemetry import telemetry
@@ -35,6 +36,8 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     """Where the gateway listens, udp:// or tcp://."""
     listen: bool = False
     """Listen there with TCP instead, as SITL does, and let the gateway connect."""
+    signing: str = ""
+    """File with the link's signing key, as in a gateway's robots.mavlink."""
     system: int = 1
     site: Site = field(default_factory=Site)
     start: str = "home"
@@ -99,7 +102,8 @@ class Simulation:
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until `stop` is set."""
-        codec = Codec(self._settings.system, dialect.COMPONENT_AUTOPILOT)
+        signer = Signer(read_key(self._settings.signing), link_id=0) if self._settings.signing else None
+        codec = Codec(self._settings.system, dialect.COMPONENT_AUTOPILOT, signer=signer)
         self._link = await open_link(self._settings.remote, codec, self._heard)
         log.info("simulated copter", system=self._settings.system, to=self._settings.to)
         began = before = time.monotonic()
