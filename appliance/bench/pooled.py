@@ -24,7 +24,7 @@ WARM_UP_S = 60.0
 FLEET = "bench"
 """Fleets of benchmarks are called so, and have a random number behind it."""
 SKILL = "bench_nothing"
-MANIFEST = """
+_MANIFEST = """
 id = "{skill}"
 domain = "coordination"
 summary = "Do nothing, to measure how long it takes to begin."
@@ -68,11 +68,11 @@ def fleet_name() -> str:
     return f"{FLEET}-{secrets.token_hex(4)}"
 
 
-def write_skill(folder: Path, image: str, *, skill: str = SKILL, handler: str = _HANDLER) -> Path:
-    """Write a skill of the benchmark; returns the folder of skills it is in."""
+def write_skill(folder: Path, image: str, *, skill: str = SKILL, handler: str = _HANDLER, more: str = "") -> Path:
+    """Write a skill of the benchmark, with `more` lines in its manifest; returns the folder of skills it is in."""
     where = folder / "skills" / skill
     where.mkdir(parents=True)
-    (where / "skill.toml").write_text(MANIFEST.format(skill=skill, image=image))
+    (where / "skill.toml").write_text(_MANIFEST.format(skill=skill, image=image) + more)
     (where / "handler.py").write_text(handler)
     return where.parent
 

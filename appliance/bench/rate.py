@@ -3,8 +3,9 @@
 Each mode gets a fleet of its own with the same containers, memory and queue; only how it uses them differs:
 
     cold       a new container for each run
-    local      the paper's baseline: warm containers of this gateway only, kept for ten minutes after their last run
-    federated  those of other gateways too
+    local      the paper's baseline: warm containers of this gateway only, kept for ten minutes after their last run,
+               none started ahead beyond the first, which it is given so that it is not made worse than it has to be
+    federated  those of other gateways too, and whatever the product's defaults start ahead
 
 Rates are offered in rising order as an open loop (`load`), with a pause in between until nothing runs any more; the
 first one that is too much ends the ladder. All of it shares the machine with the fleet, and the sender is seen too.
@@ -17,6 +18,7 @@ from typing import Any, Literal
 
 import psutil
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.bench import fleet
 from appliance.bench.figures import ratio
@@ -72,10 +74,16 @@ class Options(Struct, frozen=True, kw_only=True):
 
 def pool_of(mode: Mode, image: str) -> PoolConfig:
     """Return the pool of one gateway in a mode: in all of them as many containers, as much memory, the same queue."""
-    floor = {} if mode == "cold" else {image: 1}
-    return PoolConfig(
-        mode=mode, floor=floor, capacity=PER_GATEWAY, memory_mb=PER_GATEWAY * 256, container_memory_mb=256, idle_s=600.0
+    alike = PoolConfig(
+        mode=mode,
+        floor={} if mode == "cold" else {image: 1},
+        capacity=PER_GATEWAY,
+        memory_mb=PER_GATEWAY * 256,
+        container_memory_mb=256,
     )
+    if mode == "federated":
+        return alike
+    return replace(alike, prewarm=(), keep="fixed", idle_s=600.0, eviction="lru")
 
 
 async def run(options: Options, *, progress: Progress) -> dict[str, Any]:

@@ -88,6 +88,47 @@ def rate(
     return 0
 
 
+@bench_app.command
+def refill(
+    *,
+    containers: int = 8,
+    at_once: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (1, 2, 4),
+    image: str = "base",
+    as_json: Json = False,
+) -> int:
+    """How fast an empty pool fills with ready containers.
+
+    Args:
+        containers: How many.
+        at_once: Starts at the same time; one measurement each.
+        image: Image of the containers.
+    """
+    from appliance.bench.refill import run
+
+    result = measure(run(containers, at_once, image=image, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0
+
+
+@bench_app.command
+def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: int = 1, as_json: Json = False) -> int:
+    """Thousands of subtasks through one gateway, some of which misbehave: counts before and after, leaks, memory.
+
+    Ends with 1 when something leaked, a run was lost, or memory was not flat.
+
+    Args:
+        count: Subtasks.
+        at_once: How many at the same time.
+        image: Image of the containers.
+        seed: Which subtasks misbehave.
+    """
+    from appliance.bench.soak import run
+
+    result = measure(run(count, at_once=at_once, image=image, seed=seed, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table({**result, "checkpoints": len(result["checkpoints"])}))
+    return 0 if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else 1
+
+
 @bench_app.command(name="record")
 def bench_record(*, messages: int = 50_000, rounds: int = 3, as_json: Json = False) -> int:
     """Logging: messages/s of the recorder's writer beside the bare MCAP library.

@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from appliance.bench import actors, federated, pooled, rate, startup
+from appliance.bench import actors, federated, pooled, rate, refill, soak, startup
 from appliance.pool.engine import PodmanEngine
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
@@ -133,3 +133,22 @@ async def test_the_talk_with_rays_side(monkeypatch: pytest.MonkeyPatch, tmp_path
     fake.write_text(f"#!{sys.executable}\nraise SystemExit('no such thing')\n")
     with pytest.raises(actors.PoolError, match="no such thing"):
         await actors.run(1, 1, progress=lambda _: None)
+
+
+async def test_refill(built: None) -> None:
+    """An empty pool fills, by one and by two starts at the same time."""
+    result = await refill.run(2, (1, 2), progress=lambda _: None)
+    for starts in (1, 2):
+        assert result[f"starts_at_once_{starts}"]["containers_per_s"] > 0
+        assert result[f"starts_at_once_{starts}"]["podman_requests"] >= 2
+
+
+async def test_soak(built: None) -> None:
+    """Runs of all kinds end as they must, containers are replaced and killed, and counts are what they were."""
+    result = await soak.run(60, at_once=2, progress=lambda _: None)
+    assert result["lost"] == 0
+    assert sum(result["unexpected"].values()) <= result["killed_from_outside"]
+    assert result["killed_from_outside"] >= 1
+    assert set(soak.SHARES) <= set(result["ended"])
+    assert result["census"]["leaks"] == {}
+    assert result["census"]["after"]["containers"] == result["census"]["after"]["conmon"] == soak.CONTAINERS
