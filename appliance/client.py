@@ -14,10 +14,20 @@ from typing import Self, TypeVar
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
+from appliance.errors import DeadlineError, NotFoundError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import Notice, RunEvent, TaskRecord, TaskRequest, TaskState
 from appliance.plane.node import PlaneClient
 from appliance.plane.settings import PlaneConfig
+from appliance.pool.api import (
+    DecisionList,
+    DecisionsAsk,
+    EvictAsk,
+    Evicted,
+    ReleaseAsk,
+    Released,
+    WarmAsk,
+    Warmed,
+)
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 
 R = TypeVar("R", bound=Struct)
@@ -114,6 +124,81 @@ class FleetClient:
     async def cancel(self, task: str) -> TaskRecord:
         """Stop a task."""
         return await self._ask("cancel", TaskAsk(id=task), TaskRecord)
+
+    # --- pools ------------------------------------------------------------------------------------------------
+
+    async def pool_warm(self, gateway: str, ask: WarmAsk) -> Warmed:
+        """Have a gateway keep containers of an image ready."""
+        await self._known(gateway)
+        return await self.plane.rpc.call(gateway, "pool_warm", ask, Warmed, timeout_s=ask.wait_s + 5.0)
+
+    async def pool_evict(self, name: str, gateway: str = "") -> dict[str, Evicted]:
+        """Give up a container, by its id or the beginning of it, or all idle ones of an image; answers by gateway.
+
+        Raises:
+            NotFoundError: no gateway has such a container, or image.
+            RefusedError: several containers begin so, or it is not idle.
+        """
+        await self._known(gateway)
+        held = [
+            (each, container)
+            for each, containers in self.plane.registry.containers.items()
+            for container in containers
+            if container.startswith(name) and gateway in ("", each)
+        ]
+        if len(held) > 1 and name not in (container for _, container in held):
+            ids = ", ".join(sorted(container for _, container in held))
+            raise RefusedError(f"several containers begin with {name}: {ids}", remedy="write more of it")
+        if held:
+            where, container = min(held, key=lambda each: (each[1] != name, each))
+            ask = EvictAsk(container=container)
+            return {where: await self.plane.rpc.call(where, "pool_evict", ask, Evicted)}
+        return await self._all_of(gateway, "pool_evict", EvictAsk(image=name), Evicted)
+
+    async def pool_release(self, image: str, gateway: str = "") -> dict[str, Released]:
+        """Have an image started again that is in quarantine, on one gateway or wherever it is."""
+        return await self._all_of(gateway, "pool_release_quarantine", ReleaseAsk(image=image), Released)
+
+    async def pool_decisions(
+        self, limit: int, gateway: str = ""
+    ) -> tuple[dict[str, DecisionList], dict[str, SwiftbotError]]:
+        """What pools started and gave up lately, by gateway; and why the others did not tell."""
+        await self._known(gateway)
+        return await self._each(gateway, "pool_decisions", DecisionsAsk(limit=limit), DecisionList)
+
+    async def _known(self, gateway: str) -> None:
+        """Raise when there is no such gateway, or none at all."""
+        await self.gateway()
+        if gateway and gateway not in self.plane.members():
+            known = ", ".join(sorted(self.plane.members()))
+            raise NotFoundError(f"no gateway {gateway[:60]!r} is there", remedy=f"there are: {known}")
+
+    async def _each(
+        self, gateway: str, verb: str, request: Struct, reply: type[R]
+    ) -> tuple[dict[str, R], dict[str, SwiftbotError]]:
+        """Ask one gateway, or all; what they answered, and why some did not."""
+        names = [gateway] if gateway else sorted(self.plane.members())
+        calls = (self.plane.rpc.call(name, verb, request, reply) for name in names)
+        found: dict[str, R] = {}
+        failed: dict[str, SwiftbotError] = {}
+        for name, answer in zip(names, await asyncio.gather(*calls, return_exceptions=True), strict=True):
+            if isinstance(answer, SwiftbotError):
+                failed[name] = answer
+            elif isinstance(answer, BaseException):
+                raise answer
+            else:
+                found[name] = answer
+        return found, failed
+
+    async def _all_of(self, gateway: str, verb: str, request: Struct, reply: type[R]) -> dict[str, R]:
+        """The same, but when none did what was asked, the reason of the first is raised."""
+        await self._known(gateway)
+        found, failed = await self._each(gateway, verb, request, reply)
+        if not found:
+            raise failed[min(failed)]
+        return found
+
+    # --- watching ---------------------------------------------------------------------------------------------
 
     async def watch(self, task: str, *, poll_s: float = 1.0) -> AsyncGenerator[TaskRecord]:
         """Yield a task's record whenever it changes, until it has ended; survives the loss of gateways.

@@ -4,15 +4,18 @@ Rich finds out whether it writes to a terminal: without one there are no colours
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
 from appliance.doctor import Check
 from appliance.model import (
+    Choice,
     ContainerInfo,
     GatewayStatus,
     Plan,
@@ -21,10 +24,13 @@ from appliance.model import (
     SubtaskState,
     TaskRecord,
     TaskState,
+    Way,
 )
+from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
 from appliance.record.facts import LogInfo
 from appliance.tasks.replay import ReplayReport
+from appliance.tasks.why import AttemptWhy, TaskWhy
 
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
@@ -110,10 +116,14 @@ def brief(record: SubtaskRecord) -> str:
         return record.failure.message
     if record.note and not record.state.final:
         return record.note
-    if not record.result:
-        return ""
+    if record.partial and not record.result and not record.state.final:
+        return f"so far: {_values(record.partial)}"
+    return _values(record.result or {})
+
+
+def _values(result: dict[str, Any]) -> str:
     shown: list[str] = []
-    for key, value in record.result.items():
+    for key, value in result.items():
         if isinstance(value, dict):
             if "artifact" in value:
                 shown.append(f"{key}={value.get('name')} ({value.get('bytes')} B)")  # pyright: ignore[reportUnknownMemberType]
@@ -148,16 +158,30 @@ def task_table(record: TaskRecord) -> Group:
         (str(record.state), _TASK_STYLES.get(record.state, "yellow")),
         f"  coordinated by {record.coordinator}\n{record.instruction}",
     )
+    ways = [Text(f"  {each.subtask.id} {way}", style="dim") for each in record.subtasks if (way := _way_text(each))]
     told = [
         Text(f"  {each.subtask.id}: {text}", style="red" if each.failure and not each.result else "dim")
         for each in record.subtasks
         if (text := brief(each))
     ]
-    parts: list[object] = [head, table, *told]
+    parts: list[object] = [head, table, *ways, *told]
     if record.failure is not None:
         remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""
         parts.append(Text(f"{record.failure.message}{remedy}", style="red"))
     return Group(*parts)  # pyright: ignore[reportArgumentType]
+
+
+def _way_text(record: SubtaskRecord) -> str:
+    """How its container came to serve it, where that was not simply a ready one of the gateway that was asked."""
+    choice = record.attempts[-1].choice if record.attempts else None
+    if choice is None or choice.way is Way.HERE:
+        return ""
+    told = {
+        Way.RUN_THERE: f"was passed on to {choice.gateway}",
+        Way.BRING_HERE: f"had its state brought to {choice.gateway}",
+        Way.NEW: f"got a new container on {choice.gateway}",
+    }
+    return f"{told[choice.way]} by {choice.by}: {choice.why}"
 
 
 def progress_line(record: SubtaskRecord) -> str:
@@ -224,6 +248,79 @@ def container_table(containers: Sequence[ContainerInfo]) -> Table:
             milliseconds(each.cold_ms),
             each.run,
         )
+    return table
+
+
+def why_text(found: TaskWhy) -> Group:
+    """Why each attempt was served where it was: who decided, and a table of what was weighed. Fits 80 columns."""
+    parts: list[RenderableType] = [
+        Text.assemble(("task ", "bold"), found.id, f" {found.state}  coordinated by {found.coordinator}")
+    ]
+    for each in found.subtasks:
+        waits = f"  {each.note}" if each.note and not each.attempts else ""
+        parts.append(Text.assemble("\n", (each.id, "bold"), f" {each.skill}  {each.state}{waits}"))
+        for attempt in each.attempts:
+            parts.extend(_attempt_text(attempt))
+    return Group(*parts)
+
+
+def _attempt_text(attempt: AttemptWhy) -> Iterator[RenderableType]:
+    served = f", container {attempt.container[:12]}, {attempt.phase}" if attempt.container else ""
+    yield Text(f"  attempt {attempt.number} on {attempt.gateway}{served}")
+    if attempt.placed:
+        yield Padding(Text(f"gateways by coarse score: {attempt.placed}", style="dim"), (0, 0, 0, 4))
+    if attempt.choice is not None:
+        choice = attempt.choice
+        yield Padding(Text(f"{choice.by} decided: {choice.way}, {choice.why}"), (0, 0, 0, 4))
+        if choice.considered:
+            yield Padding(_considered_table(choice), (0, 0, 0, 4))
+    elif not attempt.failure:
+        yield Padding(Text("how its container was chosen is not known (yet)", style="dim"), (0, 0, 0, 4))
+    if attempt.failure is not None:
+        yield Padding(Text(f"failed: {attempt.failure.message}", style="red"), (0, 0, 0, 4))
+
+
+def _considered_table(choice: Choice) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold dim", padding=(0, 1, 0, 0))
+    table.add_column("")
+    table.add_column("gateway", overflow="fold", max_width=14)
+    table.add_column("container", no_wrap=True)
+    table.add_column("way", no_wrap=True)
+    table.add_column("score", justify="right", no_wrap=True)
+    table.add_column("cost", justify="right", no_wrap=True)
+    table.add_column("verdict", overflow="fold")
+    for each in choice.considered:
+        table.add_row(
+            "▸" if each.taken else "",
+            each.gateway,
+            each.container[:8] or "–",
+            str(each.way),
+            f"{each.score:.2f}" if each.container else "–",
+            milliseconds(each.cost_ms) if each.image else "–",
+            each.verdict,
+            style="" if each.taken else "dim",
+        )
+    return table
+
+
+def evicted_text(found: Mapping[str, Evicted]) -> Text:
+    """What pools gave up and what they kept, a line a gateway."""
+    lines: list[str] = []
+    for gateway, answer in sorted(found.items()):
+        gone = f"gave up {', '.join(answer.containers)}" if answer.containers else "had none idle"
+        kept = "".join(f"; kept {name}: {reason}" for name, reason in answer.kept.items())
+        lines.append(f"{gateway} {gone}{kept}{f'; {answer.note}' if answer.note else ''}")
+    return Text("\n".join(lines))
+
+
+def decision_table(rows: Sequence[tuple[str, PoolDecision]]) -> Table:
+    """What pools started and gave up, newest first; times of this machine's zone."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("at", "gateway", "what", "image", "container", "why"):
+        table.add_column(name, overflow="fold")
+    for gateway, each in rows:
+        at = datetime.fromtimestamp(each.at_ns / 1e9).astimezone()
+        table.add_row(f"{at:%H:%M:%S}", gateway, each.what, each.image, each.container[:12], each.why)
     return table
 
 

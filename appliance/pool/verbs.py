@@ -49,18 +49,18 @@ class Verbs:
         self._refused = refused
 
     async def hint(self, hint: PoolHint) -> Hinted:
-        """Take note of what another gateway's plan will need here; best effort.
+        """Take note of what another gateway's plan will need here; best effort. A count of 0 takes it back.
 
         Raises:
             NotFoundError: there is no such image.
             PayloadError: numbers that cannot be.
         """
         self._check_image(hint.image)
-        if not (hint.count >= 1 and 0 <= hint.in_s <= MOST_AHEAD_S and 0 < hint.keep_s <= MOST_AHEAD_S):
+        if not (hint.count >= 0 and 0 <= hint.in_s <= MOST_AHEAD_S and 0 < hint.keep_s <= MOST_AHEAD_S):
             self._refused["bad hint"] += 1
             raise PayloadError(
                 f"{hint.count} containers in {hint.in_s:g} s for {hint.keep_s:g} s cannot be had ready",
-                remedy=f"at least one, within and for at most {MOST_AHEAD_S:g} s",
+                remedy=f"none or more, within and for at most {MOST_AHEAD_S:g} s",
             )
         if why := self._no_warming():
             return Hinted(taken=False, why=why)
