@@ -78,6 +78,8 @@ def stems(text: str) -> frozenset[str]:
             found.add(str(_TENS[first] * 10 + (int(NUMBERS.get(second, "0")) % 10)))
         if first in NUMBERS and second in NUMBERS:  # room two one four
             found.add(NUMBERS[first] + NUMBERS[second])
+    for first, last in re.findall(r"\b(\d{1,4})\s*(?:to|through|thru|till|-|–)\s*(\d{1,4})\b", text.lower()):
+        found |= {str(number) for number in range(int(first), min(int(last), int(first) + 50))}
     found |= {part for word in words for part in re.findall(r"[a-z]+|[0-9]+", word)}
     return frozenset(found)
 

@@ -66,7 +66,7 @@ def too_near(
             yield f"{name}: the same sentence as {frames[frame]} with other nouns"
         for other, there in bags:
             shared = len(bag & there)
-            if bag == there or (shared >= 3 and shared >= SHARED * len(bag | there)):
+            if (bag and bag == there) or (shared >= 3 and shared >= SHARED * len(bag | there)):
                 yield f"{name}: has most words in common with {other}"
                 break
         if others is None:
