@@ -40,7 +40,7 @@ class Call(Struct, frozen=True, kw_only=True):
     args: dict[str, Any]
 
 
-def order(request: RunRequest, site: dict[str, Any]) -> Frame:
+def order(request: RunRequest) -> Frame:
     """Return the frame that starts a run."""
     return {
         "op": "run",
@@ -51,7 +51,6 @@ def order(request: RunRequest, site: dict[str, Any]) -> Frame:
         "inputs": request.inputs,
         "attempt": request.attempt,
         "resume": request.resume,
-        "site": site,
         "timeout_s": request.deadline_s,
         "memory_mb": request.need.memory_mb,
     }

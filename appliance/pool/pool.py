@@ -89,7 +89,13 @@ class Pool:
 
         def make_starter(on_death: Callable[[PooledContainer], None]) -> Starter:
             return Starter(
-                config, gateway=gateway, fleet=fleet, run_dir=run_dir, catalogue=catalogue, on_death=on_death
+                config,
+                gateway=gateway,
+                fleet=fleet,
+                run_dir=run_dir,
+                catalogue=catalogue,
+                site=msgspec.to_builtins(site),
+                on_death=on_death,
             )
 
         self._keeper = Keeper(
@@ -106,7 +112,6 @@ class Pool:
             config,
             self._keeper,
             gateway=gateway,
-            site=msgspec.to_builtins(site),
             on_call=on_call,
             refused=self.refused,
         )

@@ -38,7 +38,7 @@ class _Run:
 
 
 class Runs:
-    """Carries runs out in the keeper's containers. `site` is the map that handlers get."""
+    """Carries runs out in the keeper's containers."""
 
     def __init__(
         self,
@@ -46,14 +46,12 @@ class Runs:
         keeper: Keeper,
         *,
         gateway: str,
-        site: dict[str, Any],
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         refused: Counter[str],
     ) -> None:
         self._config = config
         self._keeper = keeper
         self._gateway = gateway
-        self._site = site
         self._on_call = on_call
         self._refused = refused
         self._runs: dict[str, _Run] = {}
@@ -121,7 +119,7 @@ class Runs:
             run.began = time.monotonic()
             keeper.taken(container, request.run_id)
             try:
-                return container, await container.begin(order(request, self._site)), phase
+                return container, await container.begin(order(request)), phase
             except UnreachableError:
                 keeper.retire(container, "it was found dead")  # nothing has run
             except SwiftbotError:

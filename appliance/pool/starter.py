@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import structlog
 from msgspec import Struct
@@ -21,7 +22,7 @@ from msgspec.structs import replace
 from appliance.errors import PoolError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool import images
-from appliance.pool.container import PooledContainer
+from appliance.pool.container import SOCKET, PooledContainer
 from appliance.pool.engine import (
     LABEL_FLEET,
     LABEL_GATEWAY,
@@ -39,6 +40,10 @@ from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
 log = structlog.get_logger(__name__)
 
 RUNNER = Path(__file__).resolve().parent / "runner"
+SPEC = "spec.json"
+"""What a container's runner is told, in the container's folder."""
+PRELOAD_PART = 0.4
+"""Part of the time for a start that loading may take; it happens twice where it is rehearsed first."""
 ADOPT_TIMEOUT_S = 2.0
 LABEL_SIZE = "swiftbot.size"
 
@@ -62,6 +67,7 @@ class Starter:
         fleet: str,
         run_dir: Path,
         catalogue: Catalogue,
+        site: dict[str, Any],
         on_death: Callable[[PooledContainer], None],
     ) -> None:
         self._config = config
@@ -69,9 +75,11 @@ class Starter:
         self._fleet = fleet
         self._run_dir = run_dir
         self._catalogue = catalogue
+        self._site = site
+        self._proven: set[str] = set()
         self._on_death = on_death
         self._labels = {LABEL_FLEET: fleet, LABEL_GATEWAY: gateway}
-        self._code = code_digest(catalogue)
+        self._code = code_digest(catalogue) + hashlib.sha256(json.dumps(site, sort_keys=True).encode()).hexdigest()
 
     def skills(self, image: str) -> list[SkillManifest]:
         """Return the skills that a container of an image can run: its own and those of compatible images."""
@@ -87,6 +95,7 @@ class Starter:
             *(each.memory_mb for each in own),
             *([need.memory_mb] if need else []),
         ]
+        memories = [each + sum(skill.preload_mb for skill in self.skills(image)) for each in memories]
         volumes = {name for each in own for name in each.volumes} | set(need.volumes if need else ())
         return Size(cpu=max(cpus), memory_mb=max(memories), volumes=tuple(sorted(volumes)))
 
@@ -115,7 +124,8 @@ class Starter:
         """
         began = time.monotonic()
         spec = self._spec(container, facts)
-        await asyncio.to_thread(container.folder.mkdir, mode=0o700, parents=True)
+        runner = self._runner_spec(container.info)
+        await asyncio.to_thread(_write, container.folder, runner)
 
         async def alive() -> None:
             found = await engine.containers({**self._labels, LABEL_ID: container.id})
@@ -137,6 +147,8 @@ class Starter:
             raise
         cold_ms = (time.monotonic() - began) * 1e3
         container.info = replace(container.info, cold_ms=cold_ms)
+        if not container.problems:
+            self._proven.add(self._made(container.info.image))
         for what, problem in container.problems.items():
             log.warning("not preloaded", container=container.id, image=container.info.image, what=what, reason=problem)
 
@@ -230,20 +242,42 @@ class Starter:
         parts = (self._reference(image), self._code, config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
+    def _roots(self, image: str) -> dict[str, str]:
+        """Return where the folders of an image's skills are mounted, by folder."""
+        roots = {str(SKILLS): "/skills"}
+        for skill in self.skills(image):
+            roots.setdefault(str(skill.folder.parent), f"/skills-{len(roots)}")
+        return roots
+
+    def _runner_spec(self, info: ContainerInfo) -> dict[str, Any]:
+        """Return what a container's runner is told: see `runner/spec.py`."""
+        roots = self._roots(info.image)
+        skills = self.skills(info.image)
+        modules = [*self._catalogue.images[info.image].preload, *(name for each in skills for name in each.preload)]
+        return {
+            "skills": {
+                each.id: {
+                    "folder": f"{roots[str(each.folder.parent)]}/{each.folder.name}",
+                    "loads": each.loads,
+                    "preload_mb": each.preload_mb,
+                    "preload_s": each.preload_s,
+                    "file_mb": each.file_mb,
+                }
+                for each in skills
+            },
+            "modules": list(dict.fromkeys(modules)),
+            "site": self._site,
+            "volumes": "/volumes",
+            "patience_s": PRELOAD_PART * self._config.start_timeout_s,
+            "proven": self._made(info.image) in self._proven,
+        }
+
     def _spec(self, container: PooledContainer, facts: EngineFacts) -> ContainerSpec:
         config, info = self._config, container.info
-        image = self._catalogue.images[info.image]
-        binds = {str(container.folder): "/run/swiftbot", str(SKILLS): "/skills", str(RUNNER): "/runner"}
-        folders: dict[str, str] = {}
-        modules = list(image.preload)
-        for skill in self.skills(info.image):
-            root = skill.folder.parent
-            place = binds.setdefault(str(root), f"/skills-{len(binds)}")
-            folders[skill.id] = f"{place}/{skill.folder.name}"
-            modules += skill.preload
-        runner = {"skills": folders, "modules": list(dict.fromkeys(modules))}
+        binds = {str(container.folder): "/run/swiftbot", str(RUNNER): "/runner", **self._roots(info.image)}
         processes = 0 if facts.limits_enforced else config.user_processes
-        command = ("python3", "-s", "-m", "runner.main", "--socket", "/run/swiftbot/runner.sock")
+        inside = "/run/swiftbot"
+        command = ("python3", "-s", "-m", "runner.main", "--socket", f"{inside}/{SOCKET}", "--spec", f"{inside}/{SPEC}")
         size = {"cpu": info.cpu, "memory_mb": info.memory_mb, "volumes": info.volumes}
         labels = {
             LABEL_ID: info.id,
@@ -254,7 +288,7 @@ class Starter:
         return ContainerSpec(
             name=f"swiftbot-{self._fleet}-{self._gateway}-{info.id}",
             image=self._reference(info.image),
-            command=(*command, "--processes", str(processes), "--spec", json.dumps(runner)),
+            command=(*command, "--processes", str(processes)),
             labels=self._labels | labels,
             binds=binds,
             writable=frozenset({str(container.folder)}),
@@ -275,6 +309,11 @@ class Starter:
             seccomp_profile=config.seccomp_profile,
             limits=facts.limits_enforced,
         )
+
+
+def _write(folder: Path, runner: dict[str, Any]) -> None:
+    folder.mkdir(mode=0o700, parents=True)
+    (folder / SPEC).write_text(json.dumps(runner), encoding="utf-8")
 
 
 def code_digest(catalogue: Catalogue) -> str:

@@ -79,6 +79,14 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Named volumes it wants mounted."""
     preload: tuple[str, ...] = ()
     """Modules the zygote imports beforehand, besides the handler itself and the image's own list."""
+    loads: tuple[Annotated[str, Meta(min_length=1, max_length=300)], ...] = ()
+    """Files its `preload` reads: `PATH` in its own folder, or `VOLUME:PATH` in one of `volumes`."""
+    preload_mb: Annotated[int, Meta(ge=0, le=65536)] = 0
+    """Memory its `preload` may take; 0: it has none. A container of its image is given so much more."""
+    preload_s: Annotated[float, Meta(gt=0, le=600)] = 10.0
+    """Longest `preload`; all that a container loads has at most 40 % of `pool.start_timeout_s` besides."""
+    file_mb: Annotated[int, Meta(ge=1, le=1 << 20)] = 256
+    """Longest file its runs may write, in a volume too: a volume has no other bound."""
     timeout_s: Annotated[float, Meta(gt=0, le=86400)] = 120.0
     """Longest run, beyond a `duration_s` that was asked for."""
     retries: Annotated[int, Meta(ge=0, le=10)] = 1
@@ -199,7 +207,22 @@ def _manifests(root: Path) -> Iterator[SkillManifest]:
                 raise _wrong(file, f"params.{param}", "a parameter's name is of a-z, 0-9 and '_'")
         if manifest.runs == "compute" and manifest.verbs:
             raise _wrong(file, "verbs", "a skill that runs on no robot sends no robot commands")
+        _check_loads(file, manifest, folder)
         yield msgspec.structs.replace(manifest, implemented=(folder / "handler.py").is_file(), folder=folder)
+
+
+def _check_loads(file: Path, manifest: SkillManifest, folder: Path) -> None:
+    """Check what `preload` reads as far as it can be before a container is there: volumes come and go."""
+    if manifest.loads and not manifest.preload_mb:
+        raise _wrong(file, "preload_mb", "needed with `loads`: the memory that loading them may take")
+    for name in manifest.loads:
+        volume, colon, path = name.rpartition(":")
+        if colon and volume not in manifest.volumes:
+            raise _wrong(file, "loads", f"{name!r}: {volume!r} is none of its volumes")
+        if not path or path.startswith("/") or ".." in Path(path).parts:
+            raise _wrong(file, "loads", f"{name!r}: the path is to be relative and without '..'")
+        if not colon and not (folder / path).exists():
+            raise _wrong(file, "loads", f"{folder / path} is not there")
 
 
 def _images(root: Path) -> Iterator[ImageSpec]:

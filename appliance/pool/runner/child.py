@@ -1,15 +1,14 @@
 """One run, in a process forked for it: limits, captured output, the handler, and its outcome as the last frame.
 
 A fork per run is what keeps subtasks apart: modules are shared with the zygote copy-on-write, everything a
-handler changes dies with it.
+handler changes dies with it. A child that is forked ahead has done all that does not depend on its order before it
+comes: a run then begins with one message.
 """
 
 import contextlib
-import importlib.util
-import math
+import marshal
 import mmap
 import os
-import resource
 import signal
 import socket
 import sys
@@ -17,67 +16,39 @@ import threading
 import time
 import traceback
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import FrameType
 from typing import Any, NoReturn
 
-from .context import CallError, Cancelled, Context, Fail, Frame, Link
+from .context import Context
 from .frames import FrameError, encode
+from .limits import address_space, limit_ahead, limit_run
+from .link import CallError, Cancelled, Fail, Frame, Link
+from .preload import Loaded, explain
 
 MAX_RESULT = 4 * 2**20
 """Longest result in bytes of JSON; larger things are artifacts."""
 MAX_OUTPUT = 256 * 1024
 """Bytes of a handler's own stdout and stderr that are kept as log lines."""
+MAX_LINES = 2000
+"""Lines of it that are kept; a gateway passes on no more."""
 MAX_LINE = 4096
-HEADROOM = 512 * 2**20
-"""Address space on top of `memory_mb`: thread stacks and allocator arenas are reserved, hardly ever touched."""
+MAX_ORDER = 64 * 1024
+"""Longest order in bytes that is handed to a child forked ahead: it fits into a socket's buffer, so nobody waits."""
 
 # Bytes of the memory shared with the zygote.
 IN_TRANSIT, DONE, REASON = 0, 1, 2
 REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned"}
 
 
-def load_handler(skill: str, folder: str) -> ModuleType:
-    """Import `handler.py` of a skill's folder.
+class Kit:
+    """What a child is forked with. `channel` is where its order comes from when it is forked ahead."""
 
-    Raises:
-        ImportError: there is none, or it has no `run`. Whatever it raises itself while being imported.
-    """
-    path = Path(folder) / "handler.py"
-    spec = importlib.util.spec_from_file_location(f"skill_{skill}", path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise ImportError(f"{path} does not exist")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses and pickle look their module up
-    spec.loader.exec_module(module)
-    if not callable(getattr(module, "run", None)):
-        raise ImportError(f"{path} has no function run(ctx)")  # noqa: TRY004 - what cannot be imported as a handler
-    return module
-
-
-def explain(error: BaseException) -> str:
-    """Return an error as one line, with its type where the text alone would say little."""
-    return f"{type(error).__name__}: {error}"[:2000]
-
-
-def _limit(order: Frame, processes: int) -> None:
-    def cap(which: int, value: int) -> None:
-        hard = resource.getrlimit(which)[1]
-        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        with contextlib.suppress(ValueError, OSError):  # a stricter limit is already in force
-            resource.setrlimit(which, (value, value))
-
-    memory_mb = int(order.get("memory_mb", 128))
-    size = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    cap(resource.RLIMIT_AS, size + memory_mb * 2**20 + HEADROOM)
-    cap(resource.RLIMIT_NOFILE, 256)
-    cap(resource.RLIMIT_CORE, 0)
-    if processes:
-        cap(resource.RLIMIT_NPROC, processes)
-    # A busy loop that blocks signals still ends: CPU seconds of all cores over the whole time allowed.
-    cap(resource.RLIMIT_CPU, math.ceil(float(order.get("timeout_s", 120.0)) * (os.cpu_count() or 1)) + 5)
-    with contextlib.suppress(OSError):
-        # Out of memory, the kernel takes the run and leaves the zygote.
-        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+    def __init__(self, loaded: Loaded, scratch: Path, processes: int) -> None:
+        self.loaded = loaded
+        self.scratch = scratch
+        self.processes = processes
+        self.shared = mmap.mmap(-1, 4)
+        self.pipe = os.pipe()
 
 
 class _Output:
@@ -90,21 +61,23 @@ class _Output:
         self._thread.start()
 
     def _follow(self) -> None:
-        left = MAX_OUTPUT
+        left, lines_left = MAX_OUTPUT, MAX_LINES
         rest = b""
         with contextlib.suppress(Cancelled, OSError):
             while data := os.read(self._read_end, 65536):
-                if left <= 0:
+                if left <= 0 or lines_left <= 0:
                     continue  # keep the pipe flowing, or the handler would block in print
                 left -= len(data)
                 *lines, rest = (rest + data).split(b"\n")
-                for line in lines:
+                for line in lines[:lines_left]:
                     self._tell(line)
+                lines_left -= len(lines)
                 if len(rest) > MAX_LINE:
                     self._tell(rest)
                     rest = b""
-                if left <= 0:
-                    self._link.send({"ev": "log", "text": f"more output than {MAX_OUTPUT} bytes: the rest is dropped"})
+                if left <= 0 or lines_left <= 0:
+                    text = f"more output than {MAX_LINES} lines or {MAX_OUTPUT} bytes: the rest is dropped"
+                    self._link.send({"ev": "log", "text": text})
             if rest:
                 self._tell(rest)
 
@@ -130,24 +103,22 @@ def _error(
     return frame | {"retryable": retryable, "trace": trace or []}
 
 
-def _outcome(  # noqa: PLR0911 - one line for each way a handler can end
-    order: Frame, link: Link, handler: ModuleType | str, folder: str, scratch: Path, shared: mmap.mmap
-) -> Frame:
-    skill = str(order.get("skill", ""))
+def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - one line for each way a handler can end
+    name = str(order.get("skill", ""))
+    skill, spec = kit.loaded.spec.skills[name], kit.loaded.spec
     try:
-        if isinstance(handler, str):
-            handler = load_handler(skill, folder)
-        ctx = Context(link, order, scratch)
+        handler, value = kit.loaded.handler(skill)
+        ctx = Context(link, order, skill=skill, spec=spec, preloaded=value, scratch=kit.scratch)
         link.send({"ev": "started", "at": time.monotonic_ns()})
         result: Any = handler.run(ctx)
         if result is None:
             result = {}
         if not isinstance(result, dict):
-            return _error("skill", f"{skill} returned {type(result).__name__}, not a dict")
+            return _error("skill", f"{name} returned {type(result).__name__}, not a dict", remedy="return a dict")
         body = len(encode({"ev": "result", "result": result}))
     except Cancelled:
-        reason = REASONS.get(shared[REASON], "orphaned")
-        return _error(reason, f"{skill} was ended: {reason}", retryable=reason != "cancelled")
+        reason = REASONS.get(kit.shared[REASON], "orphaned")
+        return _error(reason, f"{name} was ended: {reason}", retryable=reason != "cancelled")
     except CallError as error:
         return _error(error.code, error.message, remedy=error.remedy, retryable=error.retryable)
     except Fail as error:
@@ -155,7 +126,7 @@ def _outcome(  # noqa: PLR0911 - one line for each way a handler can end
     except (FrameError, TypeError) as error:
         return _error("payload" if isinstance(error, FrameError) else "skill", explain(error), trace=_trace(error))
     except MemoryError as error:
-        text = f"{skill} ran out of its memory ({order.get('memory_mb')} MB and headroom)"
+        text = f"{name} ran out of its memory ({order.get('memory_mb')} MB and headroom)"
         return _error("memory", text, remedy="raise memory_mb in its skill.toml", retryable=True, trace=_trace(error))
     except BaseException as error:  # noqa: BLE001 - supervision boundary: whatever a handler raises is the run's outcome
         return _error("skill", explain(error), retryable=isinstance(error, OSError), trace=_trace(error))
@@ -170,23 +141,62 @@ def _trace(error: BaseException) -> list[str]:
     return [line[:300] for line in lines[-8:]]
 
 
-def main(
-    connection: socket.socket,
-    order: Frame,
-    *,
-    handler: ModuleType | str,
-    folder: str,
-    scratch: Path,
-    shared: mmap.mmap,
-    pipe: tuple[int, int],
-    processes: int,
-) -> NoReturn:
-    """Carry out one run and end the process; SIGTERM is blocked when this begins."""
+def _settle(kit: Kit, keep: int) -> int:
+    """Become a process of its own, with nothing of the zygote's but what it needs; returns its address space, bytes."""
+    os.setsid()
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    read_end, write_end = kit.pipe
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.dup2(write_end, 1)
+    os.dup2(write_end, 2)
+    low = 3
+    for kept in (*sorted({keep, read_end}), 1 << 16):
+        os.closerange(low, kept)
+        low = kept + 1
+    kit.scratch.mkdir(parents=True)
+    os.chdir(kit.scratch)
+    os.environ["HOME"] = os.environ["TMPDIR"] = str(kit.scratch)
+    reconfigure = getattr(sys.stdout, "reconfigure", None)
+    if reconfigure is not None:
+        reconfigure(line_buffering=True)
+    numpy: Any = sys.modules.get("numpy")
+    if numpy is not None:
+        numpy.random.seed()  # or every run would draw the zygote's numbers again
+    limit_ahead(kit.processes)
+    return address_space()
+
+
+def wait(kit: Kit, channel: socket.socket) -> NoReturn:
+    """Get ready, wait for an order on `channel`, carry it out; ends when the other side of it is closed."""
+    base = _settle(kit, channel.fileno())
+    message, handles, _, _ = socket.recv_fds(channel, MAX_ORDER, 1)
+    if not message or not handles:
+        os._exit(0)
+    channel.close()
+    _carry_out(kit, marshal.loads(message), socket.socket(fileno=handles[0]), base)  # noqa: S302 - of our own zygote
+
+
+def run(kit: Kit, order: Frame, connection: socket.socket) -> NoReturn:
+    """Get ready and carry out one order; SIGTERM is blocked when this begins."""
+    try:
+        base = _settle(kit, connection.fileno())
+    except OSError as error:
+        frame = _error("pool", f"the run could not be set up: {explain(error)}", retryable=True)
+        with contextlib.suppress(Cancelled):
+            Link(connection, lambda _: None).send(frame)
+            kit.shared[DONE] = 1
+        os._exit(0)
+    _carry_out(kit, order, connection, base)
+
+
+def _carry_out(kit: Kit, order: Frame, connection: socket.socket, base: int) -> NoReturn:
+    shared = kit.shared
 
     def mark(moving: bool) -> None:
         shared[IN_TRANSIT] = 1 if moving else 0
 
-    os.setsid()
     link = Link(connection, mark)
 
     def asked_to_end(number: int, frame: FrameType | None) -> None:
@@ -194,39 +204,25 @@ def main(
         link.cancel()
 
     signal.signal(signal.SIGTERM, asked_to_end)
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    read_end, write_end = pipe
-    null = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(null, 0)
-    os.dup2(write_end, 1)
-    os.dup2(write_end, 2)
-    keep = sorted({connection.fileno(), read_end})
-    low = 3
-    for kept in [*keep, 1 << 16]:
-        os.closerange(low, kept)
-        low = kept + 1
     frame: Frame
     try:
-        scratch.mkdir(parents=True)
-        os.chdir(scratch)
-        os.environ["HOME"] = os.environ["TMPDIR"] = str(scratch)
-        reconfigure = getattr(sys.stdout, "reconfigure", None)
-        if reconfigure is not None:
-            reconfigure(line_buffering=True)
-        numpy: Any = sys.modules.get("numpy")
-        if numpy is not None:
-            numpy.random.seed()  # or every run would draw the zygote's numbers again
-        _limit(order, processes)
-        output = _Output(read_end, link)
+        limit_run(
+            base=base,
+            memory_mb=int(order.get("memory_mb", 128)),
+            file_mb=kit.loaded.spec.skills[str(order["skill"])].file_mb,
+            timeout_s=float(order.get("timeout_s", 120.0)),
+        )
+        output = _Output(kit.pipe[0], link)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-        frame = _outcome(order, link, handler, folder, scratch, shared)
+        frame = _outcome(order, link, kit)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         output.finish()
     except Cancelled:
         # Asked to end before the handler began, or between its end and here.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        frame = _error(REASONS.get(shared[REASON], "orphaned"), "ended before it began", retryable=True)
-    except OSError as error:
+        reason = REASONS.get(shared[REASON], "orphaned")
+        frame = _error(reason, "ended before it began", retryable=reason != "cancelled")
+    except (OSError, RuntimeError) as error:  # RuntimeError: no further thread can be started
         frame = _error("pool", f"the run could not be set up: {explain(error)}", retryable=True)
     with contextlib.suppress(Cancelled):
         link.send(frame)

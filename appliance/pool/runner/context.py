@@ -5,141 +5,58 @@ plain blocking code and needs nothing installed. Calls are numbered in the order
 part of the effect's identity, so a handler that makes the same calls again in a later attempt doubles nothing.
 """
 
-import select
-import socket
-import threading
-from collections.abc import Callable
+import mmap
 from pathlib import Path
 from typing import Any, cast
 
-from .frames import Decoder, FrameError, encode
+from .frames import encode
+from .link import CallError, Cancelled, Fail, Frame, Link
+from .spec import Skill, Spec
 
-Frame = dict[str, Any]
+MAX_NEWS = 2**20
+"""Longest partial result and checkpoint in bytes of JSON: both are written into the task's record."""
 
 
-class Fail(Exception):  # noqa: N818 - the word skill writers use: raise ctx.Fail(...)
-    """Raised by a handler: it could not do its task, and why.
+class Surroundings:
+    """What a handler finds around it, before any run and in each.
 
-    Args:
-        message: What happened, for the operator.
-        remedy: What to do about it.
-        retryable: Whether another attempt may succeed.
+    Attributes:
+        site: The site's map, as a plain dict.
+        folder: The skill's own folder, read-only.
     """
 
-    def __init__(self, message: str, remedy: str = "", retryable: bool = False) -> None:
-        super().__init__(message)
-        self.message = str(message)
-        self.remedy = str(remedy)
-        self.retryable = bool(retryable)
+    Fail = Fail
 
+    def __init__(self, skill: Skill, spec: Spec) -> None:
+        self.site: dict[str, Any] = spec.site
+        self.folder = skill.folder
+        self._volumes = spec.volumes
 
-class CallError(Fail):
-    """The appliance could not do what the handler asked; it carries the error's code (`robot`, `deadline`, ...)."""
-
-    def __init__(self, code: str, message: str, remedy: str = "", retryable: bool = False) -> None:
-        super().__init__(message, remedy, retryable)
-        self.code = code
-
-
-class Cancelled(BaseException):
-    """The run is to end now. Not an Exception, so that `except Exception` in a handler does not swallow it."""
-
-
-class Link:
-    """The run's connection to its gateway. A cancel never tears a frame: it is held back while one moves."""
-
-    def __init__(self, connection: socket.socket, mark: Callable[[bool], None]) -> None:
-        self._socket = connection
-        self._mark = mark
-        self._decoder = Decoder()
-        self._sending = threading.Lock()
-        self._asking = threading.Lock()
-        self._held = 0
-        self._cancelled = False
-        self._count = 0
-
-    def cancel(self) -> None:
-        """Raise Cancelled in the handler, at once or as soon as the frame in transit is whole; only once."""
-        if self._cancelled:
-            return
-        self._cancelled = True
-        if not self._held:
-            raise Cancelled
-
-    def _enter(self) -> None:
-        if threading.current_thread() is threading.main_thread():
-            self._held += 1
-
-    def _leave(self, before: bool) -> None:
-        if threading.current_thread() is threading.main_thread():
-            self._held -= 1
-            if self._cancelled and not before:
-                raise Cancelled
-
-    def send(self, frame: Frame) -> None:
-        """Send one frame whole; Cancelled when the gateway is gone."""
-        data = encode(frame)
-        before = self._cancelled
-        self._enter()
-        try:
-            with self._sending:
-                self._mark(True)
-                try:
-                    self._socket.sendall(data)
-                except OSError as error:
-                    raise Cancelled from error
-                self._mark(False)
-        finally:
-            self._leave(before)
-
-    def ask(self, name: str, args: dict[str, Any]) -> Any:
-        """Make one call and wait for its answer.
+    def volume(self, name: str) -> Path:
+        """Return the folder of a named volume.
 
         Raises:
-            CallError: the appliance says why not.
-            Cancelled: the run is to end, or the gateway is gone.
+            Fail: it is not mounted here.
         """
-        with self._asking:
-            self._count += 1
-            number = self._count
-            self.send({"ev": "call", "n": number, "name": name, "args": args})
-            while True:
-                reply = self._receive()
-                if reply.get("n") != number:
-                    continue  # the answer to a call that a cancel interrupted
-                if "error" in reply:
-                    error = cast("dict[str, Any]", reply["error"] or {})
-                    raise CallError(
-                        str(error.get("code", "internal")),
-                        str(error.get("message", "")),
-                        str(error.get("remedy", "")),
-                        bool(error.get("retryable", False)),
-                    )
-                return reply.get("ok")
+        path = self._volumes / name
+        if path.parent != self._volumes or not path.is_dir():
+            raise Fail(f"there is no volume {name!r} here", "name it in `volumes` of the skill's manifest")
+        return path
 
-    def _receive(self) -> Frame:
-        while True:
-            try:
-                frame = self._decoder.next()
-            except FrameError as error:
-                raise Cancelled from error
-            if frame is not None:
-                return frame
-            select.select([self._socket], [], [])  # a cancel may interrupt here, where nothing can be lost
-            before = self._cancelled
-            self._enter()
-            try:
-                data = self._socket.recv(65536)
-                if not data:
-                    raise Cancelled
-                self._decoder.feed(data)
-            except OSError as error:
-                raise Cancelled from error
-            finally:
-                self._leave(before)
+    def map(self, path: str | Path) -> mmap.mmap:
+        """Return a file's bytes without reading them: shared by all containers, and free at a fork.
+
+        Args:
+            path: a file, relative to the skill's folder or absolute (in a volume). It must not change meanwhile.
+
+        Raises:
+            OSError, ValueError: it is not there, or empty.
+        """
+        with (self.folder / path).open("rb") as file:
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
-class Context:
+class Context(Surroundings):
     """What a handler's `run(ctx)` gets.
 
     Attributes:
@@ -147,21 +64,23 @@ class Context:
         robot: The robot it is bound to, or None.
         inputs: Results of the subtasks it comes after, by subtask id.
         attempt: 1 for the first try.
-        site: The site's map, as a plain dict.
+        resume: The last checkpoint of the attempts before, or None.
+        preloaded: What the handler's `preload` returned, or None.
         scratch: A folder of this run alone, gone afterwards.
     """
 
-    Fail = Fail
     CallError = CallError
     Cancelled = Cancelled
 
-    def __init__(self, link: Link, order: Frame, scratch: Path) -> None:
+    def __init__(self, link: Link, order: Frame, *, skill: Skill, spec: Spec, preloaded: Any, scratch: Path) -> None:
+        super().__init__(skill, spec)
         self._link = link
         self.params: dict[str, Any] = order.get("params") or {}
         self.robot: str | None = order.get("robot")
         self.inputs: dict[str, dict[str, Any]] = order.get("inputs") or {}
         self.attempt: int = int(order.get("attempt", 1))
-        self.site: dict[str, Any] = order.get("site") or {}
+        self.resume: dict[str, Any] | None = order.get("resume")
+        self.preloaded = preloaded
         self.scratch = scratch
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
@@ -195,12 +114,24 @@ class Context:
         self._link.send({"ev": "log", "text": str(text)[:4000], "fields": fields})
 
     def partial(self, result: dict[str, Any]) -> None:
-        """Publish what is known so far of the result."""
-        self._link.send({"ev": "partial", "result": result})
+        """Publish what is known so far of the result; CallError when it is longer than 1 MiB of JSON."""
+        self._tell("partial", "result", result)
 
     def checkpoint(self, data: dict[str, Any]) -> None:
-        """Keep data from which a later attempt could go on."""
-        self._link.send({"ev": "checkpoint", "data": data})
+        """Keep data from which a later attempt could go on (`ctx.resume`); CallError beyond 1 MiB of JSON."""
+        self._tell("checkpoint", "data", data)
+
+    def _tell(self, kind: str, key: str, value: dict[str, Any]) -> None:
+        if not isinstance(value, dict):  # pyright: ignore[reportUnnecessaryIsInstance] - handlers are not checked
+            raise CallError("payload", f"a {kind} is a dict, not {type(value).__name__}")
+        data = encode({"ev": kind, key: value})
+        if len(data) > MAX_NEWS:
+            raise CallError(
+                "payload",
+                f"{kind} of {len(data)} bytes, {MAX_NEWS} allowed",
+                "put large things with ctx.put_artifact and keep the reference",
+            )
+        self._link.send_encoded(data)
 
     @staticmethod
     def _dict(value: Any) -> dict[str, Any]:

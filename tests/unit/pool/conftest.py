@@ -218,16 +218,17 @@ class FakeEngine:
             raise PoolError(f"start {container}: {self.refuse}")
         spec = self.specs[container]
         back = {target: source for source, target in spec.binds.items()}
-        runner = json.loads(spec.command[spec.command.index("--spec") + 1])
-        runner["skills"] = {
-            skill: str(Path(back[str(Path(folder).parent)]) / Path(folder).name)
-            for skill, folder in runner["skills"].items()
-        }
+        file = Path(back["/run/swiftbot"]) / "spec.json"
+        runner = json.loads(file.read_text())
+        for skill in runner["skills"].values():
+            folder = Path(skill["folder"])
+            skill["folder"] = str(Path(back[str(folder.parent)]) / folder.name)
+        file.write_text(json.dumps(runner))
         scratch = self.scratch / container
         scratch.mkdir()
         self.processes[container] = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "runner.main",
-            "--socket", f"{back['/run/swiftbot']}/runner.sock", "--spec", json.dumps(runner),
+            "--socket", f"{back['/run/swiftbot']}/runner.sock", "--spec", str(file),
             "--scratch", str(scratch), cwd=RUNNER.parent,
             env={"PYTHONDONTWRITEBYTECODE": "1", "PATH": os.environ["PATH"]},
         )  # fmt: skip
@@ -398,9 +399,11 @@ async def zygote(short_dir: Path, skills_dir: Path) -> AsyncIterator[Callable[[]
 
     folder = short_dir / ("long-" * 20)
     folder.mkdir()
-    spec = {"skills": {name: str(skills_dir / name) for name in ("probe", "broken")}, "modules": ["json", "nowhere"]}
+    skills = {name: {"folder": str(skills_dir / name)} for name in ("probe", "broken")}
+    spec = {"skills": skills, "modules": ["json", "nowhere"], "site": {"name": "yard"}}
+    (folder / "spec.json").write_text(json.dumps(spec))
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "runner.main", "--socket", "runner.sock", "--spec", json.dumps(spec),
+        sys.executable, "-m", "runner.main", "--socket", "runner.sock", "--spec", "spec.json",
         "--scratch", str(short_dir), cwd=folder,
         env={"PYTHONPATH": str(RUNNER.parent), "PYTHONDONTWRITEBYTECODE": "1", "PATH": os.environ["PATH"]},
     )  # fmt: skip

@@ -61,7 +61,7 @@ async def _wait_free(zygote: Zygote) -> None:
 
 async def test_frames_of_a_run(zygote: Zygote) -> None:
     """A run tells that it started, its progress, logs, output and partial result, and ends with its result."""
-    frames = await _run(zygote, "echo", inputs={"a": {"b": 1}}, robot="r2", site={"name": "yard"})
+    frames = await _run(zygote, "echo", inputs={"a": {"b": 1}}, robot="r2")
     assert frames[0]["ev"] == "started"
     assert isinstance(frames[0]["at"], int)
     kinds = [frame["ev"] for frame in frames]
