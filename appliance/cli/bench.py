@@ -157,3 +157,38 @@ def bench_plan(*, cases: Path | None = None, limit: int = 0, as_json: Json = Fal
     result = measure(bench(cases, limit=limit, progress=console.err.print))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0
+
+
+@bench_app.command
+def dht(
+    *,
+    sizes: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (16, 64, 256, 1000, 4096, 10_000),
+    lookups: int = 4000,
+    seconds: float = 20.0,
+    seed: int = 1,
+    part: Literal["all", "simulation", "live"] = "all",
+    nodes: int = 16,
+    count: int = 500,
+    as_json: Json = False,
+) -> int:
+    """The ring simulated with the plane's own code, beside Chord; put and get live, beside the kademlia package.
+
+    Args:
+        sizes: Gateways of the simulated rings; 10,000 take some minutes.
+        lookups: Simulated lookups behind each figure.
+        seconds: Simulated time of each figure of traffic.
+        seed: Of the simulation.
+        part: Only the simulation, or only what is live.
+        nodes: Gateways, and nodes of kademlia, that run live on loopback.
+        count: Live puts and gets.
+    """
+    from appliance.bench.dht import live, simulation
+
+    result: dict[str, Any] = {}
+    if part != "live":
+        tell = console.err.print
+        result = simulation.run(sizes, lookups=lookups, seconds=seconds, seed=seed, progress=tell)
+    if part != "simulation":
+        result["live"] = measure(live.run(nodes=nodes, count=count, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0

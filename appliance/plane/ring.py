@@ -5,17 +5,25 @@ while the membership is known whole.
 """
 
 import hashlib
-from bisect import bisect_right
+from bisect import bisect_left
 from collections.abc import Iterable
+from functools import lru_cache
 
 from appliance.errors import UnreachableError
 
 RING_BITS = 160
+RING_SIZE = 2**RING_BITS
 
 
 def position(text: str) -> int:
     """Where a text lies on the ring: its SHA-1 as a number in [0, 2**160)."""
     return int.from_bytes(hashlib.sha1(text.encode(), usedforsecurity=False).digest(), "big")
+
+
+@lru_cache(maxsize=32_768)
+def point(name: str, number: int = 0) -> int:
+    """Where a gateway's virtual node of that number lies on the ring."""
+    return position(f"{name}#{number}")
 
 
 class Ring:
@@ -24,9 +32,11 @@ class Ring:
     def __init__(self, members: Iterable[str], *, virtual_nodes: int) -> None:
         self.members: frozenset[str] = frozenset(members)
         self.virtual_nodes = virtual_nodes
-        points = sorted((position(f"{name}#{n}"), name) for name in self.members for n in range(virtual_nodes))
-        self._points = [point for point, _ in points]
-        self._names = [name for _, name in points]
+        points = sorted((point(name, n), name) for name in self.members for n in range(virtual_nodes))
+        self.points: tuple[int, ...] = tuple(each for each, _ in points)
+        """Positions of all virtual nodes, ascending."""
+        self.names: tuple[str, ...] = tuple(name for _, name in points)
+        """Whose they are, in the same order."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Ring) and self.members == other.members and self.virtual_nodes == other.virtual_nodes
@@ -44,14 +54,18 @@ class Ring:
 
     def successors(self, key: str, n: int) -> tuple[str, ...]:
         """The first `n` different gateways from the key's position on, its owner first; fewer on a smaller ring."""
-        if not self._points:
+        return self.holders(position(key), n)
+
+    def holders(self, place: int, n: int) -> tuple[str, ...]:
+        """The same for a position."""
+        if not self.points:
             raise UnreachableError("the ring has no gateway", remedy="start one: `swiftbot up` or `swiftbot gateway`")
-        # A point equal to the key's position owns it: bisect_right of the position just before.
-        start = bisect_right(self._points, position(key) - 1)
+        # A point equal to the position owns it.
+        start = bisect_left(self.points, place)
         wanted = min(n, len(self.members))
         found: dict[str, None] = {}
-        for step in range(len(self._points)):
-            found[self._names[(start + step) % len(self._points)]] = None
+        for step in range(len(self.points)):
+            found[self.names[(start + step) % len(self.points)]] = None
             if len(found) == wanted:
                 break
         return tuple(found)
@@ -59,3 +73,7 @@ class Ring:
     def with_member(self, name: str) -> "Ring":
         """The ring once that gateway has joined."""
         return self if name in self.members else Ring(self.members | {name}, virtual_nodes=self.virtual_nodes)
+
+    def without_member(self, name: str) -> "Ring":
+        """The ring once that gateway has left."""
+        return Ring(self.members - {name}, virtual_nodes=self.virtual_nodes) if name in self.members else self

@@ -1,0 +1,201 @@
+"""Put and get on loopback: 16 gateways' planes beside 16 nodes of the `kademlia` package, in turns in one run.
+
+Both sides are one process with one event loop and real sockets, store the same keys and values, and are asked through
+a node at random each time. They do not promise the same: a put here is a compare-and-set ordered by the key's owner
+and stored by three gateways before it is acknowledged (`put_durable`: synced to their disks too), where kademlia's
+last writer wins in memory.
+"""
+
+import asyncio
+import contextlib
+import importlib.util
+import json
+import os
+import random
+import secrets
+import sys
+import tempfile
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from appliance.bench.figures import ratio, summary
+from appliance.errors import SwiftbotError
+from appliance.local_fleet import free_port
+from appliance.plane.node import Plane
+from appliance.plane.settings import PlaneConfig
+
+KSIZE = 5
+"""Copies of a value there; the package's own default, 20, would store it on every node."""
+REMEDY = "make ray (its environment has kademlia too), or SWIFTBOT_KADEMLIA_PYTHON=a Python that has kademlia"
+_SIDE = Path(__file__).with_name("kademlia_side.py")
+_BLOCK = 50
+"""Operations of one side before it is the other's turn."""
+_LINE_S = 60.0
+_VALUE = "x" * 400
+_FIRST_PORT, _LAST_PORT = 20_000, 30_000
+
+
+def find_python() -> Path | None:
+    """Return a Python that has kademlia: as told by SWIFTBOT_KADEMLIA_PYTHON, this one, or that of `make ray`."""
+    told = os.environ.get("SWIFTBOT_KADEMLIA_PYTHON", "")
+    if told:
+        return Path(told)
+    if importlib.util.find_spec("kademlia") is not None:
+        return Path(sys.executable)
+    prefix = Path(sys.prefix)
+    for folder in (prefix.parent / "ray", prefix / ".ray"):
+        if any(folder.glob("lib/python3*/site-packages/kademlia")):
+            return folder / "bin" / "python"
+    return None
+
+
+async def run(*, nodes: int, count: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Measure `count` puts and gets on both sides.
+
+    Returns:
+        `swiftbot` and `kademlia`: `put`, `get` (and `put_durable`), each count, p50, p90, p99 and max in ms; the
+        ratios of the medians. `kademlia` is `missing`, with how to install it, where it is not there.
+    """
+    python = find_python()
+    async with AsyncExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="swiftbot-bench-"))
+        progress(f"{nodes} gateways on loopback")
+        ours = _Ours(await stack.enter_async_context(_planes(nodes, Path(folder))))
+        sides: dict[str, _Ours | _Theirs] = {"swiftbot": ours}
+        result: dict[str, Any] = {"nodes": nodes, "value_bytes": len(_VALUE)}
+        if python is None:
+            progress(f"kademlia is not installed: {REMEDY}")
+            result["kademlia"] = {"missing": "kademlia is not installed", "remedy": REMEDY}
+        else:
+            progress(f"{nodes} nodes of kademlia")
+            sides["kademlia"] = await stack.enter_async_context(_kademlia(python, nodes))
+        times: dict[str, dict[str, list[float]]] = {name: {"put": [], "get": []} for name in sides}
+        times["swiftbot"]["put_durable"] = []
+        for block in range(-(-count // _BLOCK)):
+            progress(f"{min(count, (block + 1) * _BLOCK)} of {count}")
+            keys = [f"bench/{block}-{number}" for number in range(_BLOCK)]
+            for what in ("put", "get"):
+                for name, side in sides.items():
+                    times[name][what] += await side.do(what, keys)
+            times["swiftbot"]["put_durable"] += await ours.do("put_durable", [f"{key}-d" for key in keys])
+    figures = {name: {what: summary(found) for what, found in kinds.items()} for name, kinds in times.items()}
+    for name, side in sides.items():
+        result[name] = figures[name] | side.about()
+    if "kademlia" in sides:
+        result["kademlia_over_swiftbot"] = {
+            f"{what}_{part}": ratio(figures["kademlia"][what][part], figures["swiftbot"][what][part])
+            for what in ("put", "get")
+            for part in ("p50", "p99")
+        }
+    return result
+
+
+class _Ours:
+    """Our side."""
+
+    def __init__(self, planes: list[Plane]) -> None:
+        self._planes = planes
+
+    async def do(self, what: str, keys: list[str]) -> list[float]:
+        """Put or get these keys one after the other; returns how long each took, ms."""
+        times: list[float] = []
+        for key in keys:
+            dht = random.choice(self._planes).dht  # noqa: S311 - spreads load
+            began = time.perf_counter()
+            if what == "get":
+                if await dht.read(key) is None:
+                    raise SwiftbotError(f"{key} was put and is not there")
+            else:
+                await dht.write(key, _VALUE.encode(), expected=None, durable=what == "put_durable")
+            times.append((time.perf_counter() - began) * 1e3)
+        return times
+
+    def about(self) -> dict[str, Any]:
+        """What else belongs to the result."""
+        return {"copies": self._planes[0].config.replicas}
+
+
+@asynccontextmanager
+async def _planes(nodes: int, folder: Path) -> AsyncGenerator[list[Plane]]:
+    """Gateways' planes, linked with each other and reconciled."""
+    first = f"tcp/127.0.0.1:{free_port()}"
+    planes: list[Plane] = []
+    fleet = f"bench-{secrets.token_hex(4)}"
+    try:
+        for number in range(nodes):
+            # Port 0 would do for the others, but gossip tells endpoints as they were configured.
+            listen = first if number == 0 else f"tcp/127.0.0.1:{free_port()}"
+            config = PlaneConfig(listen=(listen,), connect=() if number == 0 else (first,))
+            data = folder / f"g{number}"
+            planes.append(await Plane.open(config, fleet=fleet, gateway=f"g{number}", data_dir=data))
+        async with asyncio.timeout(_LINE_S):
+            while not all(  # noqa: ASYNC110 - no single event says so of all
+                len(each.members()) == nodes and each.dht.reconciled() for each in planes
+            ):
+                await asyncio.sleep(0.05)
+        yield planes
+    finally:
+        for plane in planes:
+            await plane.close()
+
+
+class _Theirs:
+    """The side of kademlia: a process that obeys."""
+
+    def __init__(self, process: asyncio.subprocess.Process, version: str) -> None:
+        self._process = process
+        self._version = version
+        self._failed = 0
+
+    async def do(self, what: str, keys: list[str]) -> list[float]:
+        """As `_Ours.do`."""
+        if self._process.stdin is None:
+            raise SwiftbotError("kademlia's side has no pipes")
+        self._process.stdin.write(json.dumps({"op": what, "keys": keys, "value": _VALUE}).encode() + b"\n")
+        told = await line_of(self._process, what)
+        self._failed += int(told["failed"])
+        return [float(each) for each in told["ms"]]
+
+    def about(self) -> dict[str, Any]:
+        """What else belongs to the result."""
+        return {"copies": KSIZE, "version": self._version, "failed": self._failed}
+
+
+@asynccontextmanager
+async def _kademlia(python: Path, nodes: int) -> AsyncGenerator[_Theirs]:
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    port = random.randrange(_FIRST_PORT, _LAST_PORT)  # noqa: S311 - a range of UDP ports that is likely free
+    # -P: this folder is no place to import from.
+    process = await asyncio.create_subprocess_exec(
+        str(python), "-P", str(_SIDE), str(nodes), str(KSIZE), str(port),
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        limit=2**24, env=environment,
+    )  # fmt: skip
+    try:
+        ready = await line_of(process, "ready")
+        yield _Theirs(process, str(ready["version"]))
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+async def line_of(process: asyncio.subprocess.Process, event: str) -> dict[str, Any]:
+    """Return the next line of a side, which must be of that event; SwiftbotError otherwise."""
+    if process.stdout is None or process.stderr is None:
+        raise SwiftbotError("kademlia's side has no pipes")
+    try:
+        async with asyncio.timeout(_LINE_S):
+            line = await process.stdout.readline()
+    except TimeoutError:
+        raise SwiftbotError(f"kademlia's side told no {event} within {_LINE_S:g} s") from None
+    if not line:
+        problem = (await process.stderr.read(2**16)).decode(errors="replace").strip()
+        raise SwiftbotError(f"kademlia's side ended: {problem[-400:] or 'without a word'}", remedy=REMEDY)
+    told: dict[str, Any] = json.loads(line)
+    if told.get("event") != event:
+        raise SwiftbotError(f"kademlia's side told {str(told)[:80]}, not {event}")
+    return told
