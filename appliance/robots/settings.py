@@ -43,6 +43,14 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """File with the link's MAVLink 2 signing key, readable by this user alone: a passphrase, or `hex:` and 64 digits;
     `credential:NAME` for one that systemd hands over. Set, every frame sent is signed and frames that are unsigned,
     wrongly signed or replayed are refused. Empty: no signing, and signed frames are refused."""
+    only_in: tuple[str, ...] = ()
+    """Messages by name (`ATTITUDE`, ...) heard here that may go on to other links; none: all."""
+    not_in: tuple[str, ...] = ()
+    """But not these."""
+    only_out: tuple[str, ...] = ()
+    """Messages of other links that may be sent here; none: all. A slow radio wants few."""
+    not_out: tuple[str, ...] = ()
+    """But not these."""
     names: dict[str, str] = field(default_factory=dict[str, str])
     prefix: str = "drone_"
     """Name of a vehicle not in `names`: prefix and system id. Empty: such vehicles are refused."""
@@ -82,6 +90,9 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     mavlink: tuple[MavlinkLink, ...] = ()
     """None: this gateway has no MAVLink vehicles of its own."""
+    route: bool = True
+    """Pass frames on between links and ends, as MAVLink routers do: a ground station on one link then sees and
+    commands the vehicles of the others. Off: the gateway alone speaks to its vehicles."""
     system_id: int = 245
     """Of the gateway as a MAVLink system; ground stations use 255 downward, vehicles 1 upward."""
     component_id: int = 191

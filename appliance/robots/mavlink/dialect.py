@@ -67,13 +67,20 @@ class Codec:
         self._mav.seq = (self._mav.seq + 1) % 256
         return raw
 
+    def pass_on(self, frame: Frame) -> bytes:
+        """Return a frame of another link as this one sends it: its bytes, signed or unsigned as this link is."""
+        raw = frame.raw
+        if self.signer is not None:
+            return self._sign(_as_v2(raw), frame.message)
+        if raw[0] == MARKER_V2 and raw[2] & SIGNED_FLAG:
+            return _reframed(raw[:-SIGNATURE_BYTES], frame.message, signed=False)
+        return raw
+
     def _sign(self, raw: bytes, message: Message) -> bytes:
-        """Sign a frame: its header must say so, and the checksum covers the header."""
         assert self.signer is not None  # noqa: S101 - only called with one
-        body = bytearray(raw[:-_CHECKSUM])
-        body[2] |= SIGNED_FLAG
-        checksum = _dialect.x25crc(bytes(body[1:]) + bytes([message.crc_extra])).crc
-        frame = bytes(body) + checksum.to_bytes(2, "little")
+        if raw[2] & SIGNED_FLAG:
+            raw = raw[:-SIGNATURE_BYTES]
+        frame = _reframed(raw, message, signed=True)
         return frame + self.signer.signature(frame, self.signer.stamp(self._clock()))
 
     def read(self, data: bytes, *, more: bool = False) -> Generator[Frame | Damage, None, int]:
@@ -174,6 +181,23 @@ class Stream:
         data = self._rest + data
         used = yield from self._codec.read(data, more=True)
         self._rest = data[used:]
+
+
+def _reframed(raw: bytes, message: Message, *, signed: bool) -> bytes:
+    """Return an unsigned MAVLink 2 frame with the header saying (not) signed; the checksum covers the header."""
+    body = bytearray(raw[:-_CHECKSUM])
+    body[2] = body[2] | SIGNED_FLAG if signed else body[2] & ~SIGNED_FLAG
+    checksum: int = _dialect.x25crc(bytes(body[1:]) + bytes([message.crc_extra])).crc
+    return bytes(body) + checksum.to_bytes(2, "little")
+
+
+def _as_v2(raw: bytes) -> bytes:
+    """Return a MAVLink 1 frame as one of MAVLink 2 with room for the checksum; others as they are."""
+    if raw[0] != MARKER_V1:
+        return raw
+    length, sequence, system, component, number = raw[1:6]
+    header = bytes((MARKER_V2, length, 0, 0, sequence, system, component, number, 0, 0))
+    return header + raw[_HEADER_V1:]
 
 
 def frame_length(data: bytes, at: int) -> int | None:

@@ -3,6 +3,7 @@
 A vehicle becomes a robot of the fleet by its autopilot's heartbeat, under the name its link gives it. From then
 on the station speaks for it: it puts RobotInfo, holds its liveliness token while heartbeats come, answers
 commands, and puts every frame of it on the plane for the recorder. It takes no name that another robot has.
+Ground stations on any link are its guests: frames pass between them and the vehicles (`routing`).
 """
 
 import asyncio
@@ -22,6 +23,7 @@ from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.copter import Copter
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Address, Link, open_link
+from appliance.robots.mavlink.routing import BROADCAST, End, Passage, Router, Rules
 from appliance.robots.mavlink.signing import Memory, Signer, read_key
 from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
 from appliance.robots.settings import MavlinkLink, RobotsConfig
@@ -81,6 +83,18 @@ class Station:
         self._early: Counter[tuple[int, int]] = Counter()
         """Frames by system before its heartbeat; there are 255 systems a link."""
         self._by_source: dict[tuple[int, int], _Attached] = {}
+        self._guests: set[tuple[int, int]] = set()
+        """Link and system of ground stations and the like."""
+        rules = [
+            Rules(
+                only_in=frozenset(link.only_in),
+                not_in=frozenset(link.not_in),
+                only_out=frozenset(link.only_out),
+                not_out=frozenset(link.not_out),
+            )
+            for link in config.mavlink
+        ]
+        self._router = Router(rules, own_system=config.system_id)
         self._others: set[str] = set()
         self._watch: Closer | None = None
         self._ticking: asyncio.Task[None] | None = None
@@ -160,7 +174,14 @@ class Station:
         return receive
 
     def _receive(self, index: int, link: MavlinkLink, frame: Frame, address: Address) -> None:
+        now = asyncio.get_running_loop().time()
+        if self._router.repeated(frame.raw, now):
+            self._count("repeated")
+            return
         each = self._by_source.get((index, frame.system))
+        if each is None and self._is_guest(index, frame):
+            self._route(frame, End(index, address), now)
+            return
         if each is None:
             each = self._welcome(index, link, frame, address)
             if each is None:
@@ -171,11 +192,44 @@ class Station:
                 return
             each.address = address  # restarted, or back over another way
         vehicle = each.vehicle
-        now = asyncio.get_running_loop().time()
         if vehicle.hear(frame, now):
             each.tell = True
         self._session.put(self._session.keys.mavlink(vehicle.name, "rx"), frame.raw, encoding=FRAME_ENCODING)
         self._see(each, now)
+        self._route(frame, End(index, address), now)
+
+    def _is_guest(self, index: int, frame: Frame) -> bool:
+        """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer."""
+        if not self._config.route or frame.system == self._config.system_id:
+            return False
+        if frame.name == "HEARTBEAT" and frame.message.autopilot == dialect.AUTOPILOT_NONE:
+            if (index, frame.system) not in self._guests:
+                self._guests.add((index, frame.system))
+                log.info("MAVLink guest", link=str(self._links[index].remote), system=frame.system)
+            return True
+        if is_autopilot(frame):
+            self._guests.discard((index, frame.system))  # a vehicle whose camera or radio was heard first
+        return (index, frame.system) in self._guests
+
+    def _route(self, frame: Frame, source: End, now: float) -> None:
+        """Pass a frame on to where it is meant for."""
+        if not self._config.route:
+            return
+        passage = Passage(
+            system=frame.system,
+            component=frame.component,
+            name=frame.name,
+            raw=frame.raw,
+            target_system=getattr(frame.message, "target_system", BROADCAST),
+            target_component=getattr(frame.message, "target_component", BROADCAST),
+        )
+        self._router.hear(passage, source, now)
+        for end in self._router.destinations(passage, source):
+            raw = self._links[end.link].codec.pass_on(frame)
+            self._links[end.link].transmit(raw, end.address)
+            for (index, _), each in self._by_source.items():
+                if index == end.link and each.address == end.address:
+                    self._session.put(self._session.keys.mavlink(each.vehicle.name, "tx"), raw, encoding=FRAME_ENCODING)
 
     def _welcome(self, index: int, link: MavlinkLink, frame: Frame, address: Address) -> _Attached | None:
         """Make a robot of a new system if its frame is an autopilot's heartbeat and it may have a name."""

@@ -110,6 +110,27 @@ def test_nothing_is_forgotten_over_a_restart() -> None:
     assert again.pack(make("HEARTBEAT", **BEAT))[-12:-6][::-1] > mine[-12:-6][::-1]
 
 
+@pytest.mark.parametrize("old", [False, True])
+def test_frames_pass_between_signed_and_unsigned_links(old: bool) -> None:
+    """A frame is signed with the key of the link it goes out on, or freed of its signature; the message is the same."""
+    plain, signed, other = Codec(1, 1), codec(system=245), codec(bytes(32), system=245)
+    theirs = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
+    message = make("STATUSTEXT", severity=3, text=b"low battery")
+    raw = bytes(message.pack(theirs, force_mavlink1=True)) if old else plain.pack(message)
+    (frame,) = Codec(245, 191).read(raw)
+    assert isinstance(frame, Frame)
+    assert Codec(245, 191).pass_on(frame) == raw
+    (again,) = codec(system=9).read(signed.pass_on(frame))
+    assert isinstance(again, Frame)
+    (third,) = codec(bytes(32), system=9).read(other.pass_on(again))
+    assert isinstance(third, Frame)
+    (last,) = Codec(245, 191).read(plain.pass_on(third))
+    assert isinstance(last, Frame)
+    for each in (again, third, last):
+        assert (each.system, each.component, each.sequence) == (1, 1, frame.sequence)
+        assert each.message.text == frame.message.text
+
+
 def test_keys(tmp_path: Path) -> None:
     """A passphrase is hashed as ground stations do, a hex key is taken as it is, anything else is refused."""
     path = tmp_path / "key"
