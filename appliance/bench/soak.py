@@ -194,7 +194,7 @@ class _Soak:
         self._need = Need(image=image, cpu=0.1, memory_mb=64)
         self._engine = PodmanEngine(gateway.config.pool.podman_url, threads=1)
         self._open: dict[str, tuple[asyncio.Future[str], list[float]]] = {}
-        self._number = 0
+        self._number = self._ended = 0
         self.killed = 0
         plane = gateway.plane
         self._closer = plane.session.subscribe_typed(plane.keys.run("soak"), RunEvent, self._take)
@@ -224,7 +224,8 @@ class _Soak:
         async def worker() -> None:
             for do in waiting:
                 done.append(await self._one(do))
-                if kill_every and self._number % kill_every == 0:
+                self._ended += 1
+                if kill_every and self._ended % kill_every == 0:
                     await self._kill_one()
 
         async with asyncio.TaskGroup() as group:

@@ -129,6 +129,30 @@ def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: in
     return 0 if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else 1
 
 
+@bench_app.command(name="table")
+def bench_table(file: Path, /) -> int:
+    """Render what a benchmark printed with --json as Markdown tables.
+
+    Args:
+        file: The JSON.
+    """
+    import msgspec
+
+    from appliance.bench.tables import markdown
+    from appliance.errors import NotFoundError, PayloadError
+
+    try:
+        found = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+    except OSError as error:
+        raise NotFoundError(f"{file} cannot be read: {error.strerror}", remedy="name a file of `--json`") from error
+    except msgspec.DecodeError as error:
+        raise PayloadError(
+            f"{file} is no result: {error}", remedy="name a file of `swiftbot bench … --json`"
+        ) from error
+    console.out.print(markdown(found), markup=False, highlight=False, soft_wrap=True, end="")
+    return 0
+
+
 @bench_app.command(name="record")
 def bench_record(*, messages: int = 50_000, rounds: int = 3, as_json: Json = False) -> int:
     """Logging: messages/s of the recorder's writer beside the bare MCAP library.

@@ -1,0 +1,87 @@
+"""What a benchmark measured as Markdown tables, for `docs/benchmarks.md`. Pure."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+Row = Sequence[Any]
+
+
+def markdown(result: Mapping[str, Any]) -> str:
+    """Render a result of any benchmark.
+
+    Distributions (mappings with a `count`) become one table, ladders of rates one each, a census one of before and
+    after; what is left stands below as a list.
+    """
+    parts: list[str] = []
+    rest: list[Row] = []
+    rows: list[Row] = []
+    for name, value in _flat(result):
+        if isinstance(value, Mapping) and "count" in value:
+            rows.append((f"`{name}`", *(_figure(value.get(key)) for key in ("count", "p50", "p90", "p99", "max"))))  # pyright: ignore[reportUnknownMemberType]
+        else:
+            rest.append((f"`{name}`", _figure(value)))
+    if rows:
+        parts.append(table(("way", "count", "p50 ms", "p90 ms", "p99 ms", "max ms"), rows))
+    parts += [_ladder(each) for each in result.get("ladders", ())]
+    if "census" in result:
+        before, after = result["census"]["before"], result["census"]["after"]
+        parts.append(table(("held", "before", "after"), [(key, before[key], after[key]) for key in before]))
+    if rest:
+        parts.append("\n".join(f"- {name}: {value}" for name, value in rest))
+    return "\n\n".join(parts) + "\n"
+
+
+def table(header: Row, rows: Sequence[Row]) -> str:
+    """Return a table; a cell's `|` is escaped."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(each).replace("|", "\\|") for each in line) + " |" for line in lines)
+
+
+def _ladder(ladder: Mapping[str, Any]) -> str:
+    title = f"{ladder['mode']}, {ladder['spread']} arrivals, {ladder['service_ms']:g} ms of work"
+    rows: list[Row] = []
+    for rate, cell in ladder["cells"].items():
+        phases = ", ".join(f"{count} {phase}" for phase, count in cell["phases"].items())
+        unserved = sum(cell["unserved"].values())
+        start = cell["start"]
+        rows.append(
+            (rate, start["count"], *(_figure(start.get(key)) for key in ("p50", "p90", "p99")), unserved, phases,
+             f"{cell['cpu']:.0%}")
+        )  # fmt: skip
+    broke = ladder["breaking"]
+    if broke["breaks"] is None:
+        ending = f"Carried to {broke['holds']:g}/s, the highest rate offered."
+    else:
+        ending = f"Breaks at {broke['breaks']:g}/s: {'; '.join(broke['why'])}."
+    header = ("runs/s", "count", "p50 ms", "p90 ms", "p99 ms", "unserved", "phases", "CPU")
+    return f"{title}:\n\n{table(header, rows)}\n\n{ending}"
+
+
+_APART = frozenset({"cdf", "ladders", "census", "checkpoints"})
+
+
+def _flat(result: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return the leaves and distributions of a result by their path."""
+    found: list[tuple[str, Any]] = []
+    for key, value in result.items():
+        if key in _APART:
+            continue
+        inner = cast("Mapping[str, Any]", value if isinstance(value, Mapping) else {"count": 1})
+        if "count" in inner:
+            found.append((f"{prefix}{key}", cast("Any", value)))
+        else:
+            found += _flat(inner, f"{prefix}{key}.")
+    return found
+
+
+def _figure(value: Any) -> str:
+    """Return a number as short as it says something."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:,.1f}" if abs(value) >= 10 else f"{value:.2f}".rstrip("0").rstrip(".")
+    if isinstance(value, list):
+        return ", ".join(_figure(each) for each in cast("list[Any]", value))
+    return str(value)
