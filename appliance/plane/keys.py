@@ -57,6 +57,14 @@ class Keys:
         """Put by the answering gateway: what was asked over RPC and answered (queries cannot be subscribed to)."""
         return f"{self.root}/gw/{gateway}/exchange/{verb}"
 
+    def chunk(self, gateway: str, digest: str = "*", index: int | str = "*") -> str:
+        """Queryable: a chunk of what a gateway has announced by that digest, raw bytes."""
+        return f"{self.root}/gw/{gateway}/chunk/{digest}/{index}"
+
+    def transfer(self, gateway: str = "*", transfer: str = "*") -> str:
+        """Put by the gateway where it arrives: the progress of a transfer."""
+        return f"{self.root}/gw/{gateway}/transfer/{transfer}"
+
     def log(self, gateway: str = "*") -> str:
         """Put: LogLine."""
         return f"{self.root}/gw/{gateway}/log"

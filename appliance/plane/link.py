@@ -32,8 +32,10 @@ def open_raw(config: PlaneConfig) -> zenoh.Session:
         raise _open_error(config, str(error)) from error
 
 
-def reply(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None) -> None:
-    """Answer and end a query; the asking side may be gone, which is no concern of ours."""
+def reply(
+    query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None, *, bulk: bool = False
+) -> None:
+    """Answer and end a query; the asking side may be gone, which is no concern of ours. `bulk`: raw bytes."""
     key = str(query.key_expr) if "*" in expr else expr
     with contextlib.suppress(zenoh.ZError), query:
         if error is not None or answer is None:
@@ -41,6 +43,8 @@ def reply(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotEr
             problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
             body = ErrorReply(code=error.code, message=error.message, remedy=error.remedy, problems=problems)
             query.reply_err(encode(body), encoding="application/json")
+        elif bulk:
+            query.reply(key, answer, encoding="application/octet-stream", priority=zenoh.Priority.DATA_LOW)
         else:
             query.reply(key, answer, encoding="application/json", express=True)
 

@@ -80,6 +80,8 @@ class Session:
             on_dropped=lambda count: self.refuse("incoming queue full", count=count),
         )
         self._outbox = Outbox(messages=config.queue_messages, payload_bytes=config.queue_bytes)
+        self._bulk: Outbox | None = None
+        """Of its own, so that facts and orders never wait behind a volume on a slow link."""
         self._answering: set[asyncio.Task[None]] = set()
         self._asking: set[asyncio.Future[bytes]] = set()
         self._tokens: set[zenoh.LivelinessToken] = set()
@@ -128,8 +130,13 @@ class Session:
         """Publish that a key's fact is gone."""
         self._send(key, partial(self._raw.delete, key, congestion_control=zenoh.CongestionControl.BLOCK), 0)
 
-    def _send(self, key: str, send: Callable[[], None], size: int) -> None:
-        if not self._outbox.send(partial(link.quietly, send, key), size) and not self._closed:
+    def _send(self, key: str, send: Callable[[], None], size: int, *, bulk: bool = False) -> None:
+        outbox = self._outbox
+        if bulk:
+            outbox = self._bulk = self._bulk or Outbox(
+                messages=self.config.queue_messages, payload_bytes=self.config.queue_bytes
+            )
+        if not outbox.send(partial(link.quietly, send, key), size) and not self._closed:
             self.refuse("outgoing queue full", key=key)
 
     def subscribe(self, expr: str, callback: Callable[[Message], None]) -> Closer:
@@ -178,8 +185,10 @@ class Session:
 
     # --- questions --------------------------------------------------------------------------------------------
 
-    def serve(self, expr: str, handler: Callable[[str, bytes], Awaitable[bytes]]) -> Closer:
+    def serve(self, expr: str, handler: Callable[[str, bytes], Awaitable[bytes]], *, bulk: bool = False) -> Closer:
         """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
+
+        `bulk`: answers are raw bytes, of low priority, and wait in a queue of their own.
 
         A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
         and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
@@ -204,7 +213,7 @@ class Session:
                 error = RefusedError(f"{key}: {len(running)} queries are being answered", remedy="try again later")
                 self._refuse_query(f"too many {name}", query, expr, error)
                 return
-            task = self._loop.create_task(self._answer(handler, key, data, query, expr))
+            task = self._loop.create_task(self._answer(handler, key, data, query, expr, bulk=bulk))
             for group in (running, self._answering):
                 group.add(task)
                 task.add_done_callback(group.discard)
@@ -213,7 +222,14 @@ class Session:
         return Closer(queryable.undeclare)
 
     async def _answer(
-        self, handler: Callable[[str, bytes], Awaitable[bytes]], key: str, data: bytes, query: zenoh.Query, expr: str
+        self,
+        handler: Callable[[str, bytes], Awaitable[bytes]],
+        key: str,
+        data: bytes,
+        query: zenoh.Query,
+        expr: str,
+        *,
+        bulk: bool,
     ) -> None:
         reply: bytes | None = None
         error: SwiftbotError | None = None
@@ -236,7 +252,7 @@ class Session:
             if self._closed:
                 link.reply(query, expr, reply, error)
             else:
-                self._send(key, partial(link.reply, query, expr, reply, error), size)
+                self._send(key, partial(link.reply, query, expr, reply, error, bulk=bulk), size, bulk=bulk)
 
     def _refuse_query(self, what: str, query: zenoh.Query, expr: str, error: SwiftbotError) -> None:
         self.refuse(what, key=str(query.key_expr), reason=str(error))
@@ -415,5 +431,7 @@ class Session:
             if not answer.done():
                 answer.set_exception(UnreachableError("the session was closed"))
         await asyncio.to_thread(self._outbox.close, _CLOSE_S)
+        if self._bulk is not None:
+            await asyncio.to_thread(self._bulk.close, _CLOSE_S)
         await asyncio.to_thread(self._raw.close)
         self._inbox.close()

@@ -4,6 +4,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
+from appliance.pool.transfer.settings import TransferConfig
+
 Positive = Annotated[float, Meta(gt=0)]
 Percent = Annotated[float, Meta(gt=0, le=100)]
 
@@ -129,3 +131,5 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reconnect_s: Positive = 1.0
     """First pause before a Podman that is not there is tried again; doubles up to 30 s."""
     pressure: PressureConfig = field(default_factory=PressureConfig)
+    transfer: TransferConfig = field(default_factory=TransferConfig)
+    """How volumes and images come from other gateways."""

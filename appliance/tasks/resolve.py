@@ -9,6 +9,7 @@ import msgspec
 
 from appliance.model import SubtaskState, TaskRecord
 from appliance.plane.dht import Record
+from appliance.pool import lineage
 from appliance.tasks import checkpoints
 
 
@@ -29,9 +30,11 @@ def _rank(value: bytes) -> tuple[int, int, int, tuple[int, ...], bytes]:
 
 
 def resolver(key: str, one: Record, other: Record) -> Record:
-    """Choose between concurrent versions of any record: tasks and checkpoints by what they say, others by bytes."""
+    """Choose between concurrent versions of any record: those of known rooms by what they say, others by bytes."""
     if key.startswith("task/"):
         return one if stronger(one.value, other.value) == one.value else other
     if key.startswith(checkpoints.PREFIX) and one.deleted == other.deleted:
         return one if checkpoints.stronger(one.value, other.value) == one.value else other
+    if key.startswith(lineage.KEY) and one.deleted == other.deleted:
+        return one if lineage.stronger(one.value, other.value) == one.value else other
     return max(one, other, key=lambda record: (record.deleted, record.value))

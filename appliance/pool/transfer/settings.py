@@ -33,7 +33,9 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     most_files: Annotated[int, Meta(ge=1)] = 200_000
     """Files in a volume that is moved."""
     spool_mb: Annotated[int, Meta(ge=1)] = 16_384
-    """Disk for what arrives and for what is kept ready for others, MB; the longest unused goes first."""
+    """Disk for what arrives, MB, broken transfers included; those touched longest ago go first."""
+    cache_mb: Annotated[int, Meta(ge=1)] = 4096
+    """Disk for what is kept ready for others, MB: the last state of each volume, layers of images asked for."""
     reserve_mb: Annotated[int, Meta(ge=0)] = 512
     """Disk left free, MB: a transfer that would take it is refused."""
     backups: Annotated[int, Meta(ge=1, le=64)] = 8

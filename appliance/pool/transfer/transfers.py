@@ -6,47 +6,59 @@ Guarantees:
     - Transfers, what they hold on the disk and what is on its way are bounded (`TransferConfig`).
 """
 
+import asyncio
+import contextlib
+import secrets
+import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from msgspec import Struct
+import msgspec
+import structlog
 
+from appliance.errors import (
+    CancelledByOperatorError,
+    DeadlineError,
+    NotFoundError,
+    PayloadError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+)
 from appliance.plane.node import Plane
-from appliance.pool.engine import PodmanEngine
+from appliance.pool.lineage import Relation, VolumeRecord, relation
+from appliance.pool.storage import PodmanStorage
+from appliance.pool.transfer.api import (
+    Brought,
+    CancelAsk,
+    Cancelled,
+    FetchAsk,
+    ImageAsk,
+    ImageLayout,
+    ImageOffer,
+    Progress,
+    TransferList,
+    TransfersAsk,
+)
+from appliance.pool.transfer.fetching import ASK_S, Fetcher, Job
+from appliance.pool.transfer.flow import Link
+from appliance.pool.transfer.giving import ANSWER_S, REFERENCE_PREFIX, Giver
+from appliance.pool.transfer.images import archive, check_config, check_layout, content_digest
+from appliance.pool.transfer.manifest import Manifest
+from appliance.pool.transfer.offers import Offers
 from appliance.pool.transfer.settings import TransferConfig
+from appliance.pool.transfer.spool import Arrival, Spool
 from appliance.pool.volumes import Volumes
 
+log = structlog.get_logger(__name__)
 
-class Brought(Struct, frozen=True, kw_only=True):
-    """What a transfer did. `wire_bytes` is what came over the network, 0 when nothing had to."""
-
-    what: str
-    """`volume/NAME` or `image/REFERENCE`."""
-    gateway: str = ""
-    """Where it came from; empty when it was here already."""
-    size_bytes: int = 0
-    wire_bytes: int = 0
-    duration_ms: float = 0.0
-    resumed_bytes: int = 0
-    """What was here from an earlier try or an older state."""
-
-
-class Progress(Struct, frozen=True, kw_only=True):
-    """A transfer under way; put on `gw/{gateway}/transfer/{id}` about twice a second, and once at its end."""
-
-    id: str
-    what: str
-    gateway: str
-    """Where it arrives."""
-    source: str
-    state: str
-    """`waiting`, `preparing`, `moving`, `applying`; at the end `done`, `failed` or `cancelled`."""
-    done_bytes: int = 0
-    size_bytes: int = 0
-    rate_mbps: float = 0.0
-    """Megabits per second."""
-    problem: str = ""
+_TELL_S = 0.5
+_LOOK_S = 30.0
+"""How often Podman is asked which images are there: one may have been built or removed by hand."""
+_PENDING_S = 0.3
 
 
 class Transfers:
@@ -55,30 +67,60 @@ class Transfers:
     Args:
         config: table `[pool.transfer]`.
         plane: this gateway's membership.
-        volumes: the ledger of its state volumes.
+        volumes: the ledger of its state volumes; started and closed by its owner.
+        storage: Podman, a client of its own: an image takes seconds, and must not hold up starts. Closed by its owner.
         data_dir: the gateway's data folder; `transfer` in it is ours.
-        make_engine: Podman, a client of its own: an image takes seconds, and must not hold up starts.
     """
 
     def __init__(
-        self,
-        config: TransferConfig,
-        *,
-        plane: Plane,
-        volumes: Volumes,
-        data_dir: Path,
-        make_engine: Callable[[], PodmanEngine],
+        self, config: TransferConfig, *, plane: Plane, volumes: Volumes, storage: PodmanStorage, data_dir: Path
     ) -> None:
-        self._config, self._plane, self._volumes, self._data = config, plane, volumes, data_dir
-        self._make_engine = make_engine
         self.refused: Counter[str] = Counter()
-        """Bad input and refusals by kind, for GatewayStatus.refused."""
+        """Bad input and refusals by kind, for GatewayStatus.refused (`Volumes.refused` has those of the ledger)."""
+        self.on_change: Callable[[], None] = lambda: None
+        """Called when `images` has changed."""
+        self._config, self._plane, self._volumes, self._storage = config, plane, volumes, storage
+        self._spool = Spool(data_dir / "transfer" / "arriving", config)
+        self._offers = Offers(data_dir / "transfer" / "offered", config)
+        self._giver = Giver(
+            config, plane=plane, volumes=volumes, storage=storage, offers=self._offers, refused=self.refused
+        )
+        self._fetcher = Fetcher(config, plane=plane, spool=self._spool, offers=self._offers, refused=self.refused)
+        self._slots = asyncio.Semaphore(config.at_once)
+        self._jobs: dict[str, Job] = {}
+        """By what is brought."""
+        self._tasks: dict[str, asyncio.Task[Brought]] = {}
+        self._images: tuple[str, ...] = ()
+        self._looking: asyncio.Task[None] | None = None
+
+    # --- life -------------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Serve what others ask for, and look at what an earlier life of this gateway left in the spool."""
+        """Serve what others ask for, and look at what an earlier life of this gateway left in the spool.
+
+        Raises:
+            RefusedError: the folders cannot be made.
+        """
+        try:
+            await asyncio.to_thread(self._spool.start)
+            await asyncio.to_thread(self._offers.start)
+        except OSError as error:
+            raise RefusedError(f"transfers have no folder: {error}", remedy="make data_dir writable") from error
+        self._giver.start()
+        rpc = self._plane.rpc
+        rpc.register("image_fetch", FetchAsk, self._on_fetch)
+        rpc.register("transfers", TransfersAsk, self._on_list)
+        rpc.register("transfer_cancel", CancelAsk, self._on_cancel)
+        self._looking = asyncio.create_task(self._keep_looking(), name="look for images")
 
     async def close(self) -> None:
-        """Give up what is under way (it can be resumed) and serve no more."""
+        """Give up what is under way (it can be gone on with) and serve no more."""
+        tasks: list[asyncio.Task[Any]] = [*self._tasks.values(), *([self._looking] if self._looking else [])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._giver.close()
+        await self._fetcher.close()
 
     # --- bringing here ----------------------------------------------------------------------------------------
 
@@ -89,17 +131,20 @@ class Transfers:
         no run here uses the volume. Concurrent calls for one volume share one transfer.
 
         Raises:
-            UnreachableError: no gateway that has the newest state answers; what is here is older. The transfer
-                goes on where it was when it is asked for again.
+            UnreachableError, DeadlineError, NotFoundError: no gateway that has the newest state gives it now; what is
+                here is older. The transfer goes on where it was when it is asked for again.
             RefusedError: no room, too many transfers, too large, or a run uses the volume here or there.
             PayloadError: what arrived is not what was announced; counted, nothing changed.
             PoolError, CancelledByOperatorError: Podman will not; somebody cancelled it.
         """
-        raise NotImplementedError
+        newest = await self._volumes.newest(name)
+        if newest is None or self._volumes.has(name, newest):
+            return Brought(what=f"volume/{name}")
+        return await self._one(f"volume/{name}", partial(self._bring_volume, newest, source_gateway))
 
     async def bring_newest(self, names: Iterable[str]) -> None:
         """Bring the newest state of each volume here, as `bring_volume`: what a run asks for before it begins."""
-        raise NotImplementedError
+        await asyncio.gather(*(self.bring_volume(name) for name in dict.fromkeys(names)))
 
     async def bring_image(self, reference: str, source_gateway: str = "") -> Brought:
         """Bring an image here from a gateway that has it, only the layers that are not here; errors as above.
@@ -107,28 +152,242 @@ class Transfers:
         Raises:
             NotFoundError: no gateway that answers has it.
         """
-        raise NotImplementedError
+        if await self._storage.has_image(reference):
+            return Brought(what=f"image/{reference}")
+        return await self._one(f"image/{reference}", partial(self._bring_image, reference, source_gateway))
 
-    async def images(self) -> tuple[str, ...]:
-        """Return the references of the images that are here and can be given, for GatewayStatus.images."""
-        raise NotImplementedError
+    def images(self) -> tuple[str, ...]:
+        """References of the images that are here and can be given, for GatewayStatus.images."""
+        return self._images
+
+    async def _one(self, what: str, bring: Callable[[Job], Coroutine[Any, Any, Brought]]) -> Brought:
+        """Join the transfer of that thing, or begin it."""
+        task = self._tasks.get(what)
+        if task is None:
+            if len(self._tasks) >= self._config.at_once + self._config.waiting:
+                self.refused["transfer queue full"] += 1
+                raise RefusedError(f"{len(self._tasks)} transfers are under way or wait", remedy="try again later")
+            job = self._jobs[what] = Job(secrets.token_hex(4), what)
+            task = self._tasks[what] = asyncio.create_task(self._run(job, bring), name=f"bring {what}")
+        try:
+            return await asyncio.shield(task)
+        except asyncio.CancelledError:
+            if not task.cancelled():
+                raise  # who asked is cancelled; what is fetched goes on for others, or for the next try
+            raise CancelledByOperatorError(f"the transfer of {what} was cancelled") from None
+
+    async def _run(self, job: Job, bring: Callable[[Job], Coroutine[Any, Any, Brought]]) -> Brought:
+        began = time.monotonic()
+        telling = asyncio.create_task(self._keep_telling(job), name=f"tell of {job.what}")
+        try:
+            async with self._slots:
+                job.state = "preparing"
+                brought = await bring(job)
+            took_ms = (time.monotonic() - began) * 1e3
+            brought = msgspec.structs.replace(brought, duration_ms=round(took_ms, 3))
+            job.state = "done"
+            log.info("brought", **msgspec.to_builtins(brought))
+        except BaseException as error:
+            job.state = "cancelled" if isinstance(error, asyncio.CancelledError) else "failed"
+            job.problem = str(error)
+            log.warning("not brought", what=job.what, gateway=job.source, state=job.state, reason=str(error))
+            raise
+        finally:
+            telling.cancel()
+            del self._jobs[job.what], self._tasks[job.what]
+            self._tell(job)
+        return brought
+
+    # --- volumes ----------------------------------------------------------------------------------------------
+
+    async def _bring_volume(self, newest: VolumeRecord, first: str, job: Job) -> Brought:
+        name = newest.name
+
+        def accept(manifest: Manifest) -> str:
+            stands = relation(manifest.version, manifest.writer, newest.version, newest.gateway)
+            return "an older state" if stands in (Relation.OLDER, Relation.LOSES) else ""
+
+        sources = self._sources([first, newest.gateway, *self._volumes.where(name)])
+        if not sources:
+            raise UnreachableError(
+                f"the newest state of volume {name} is on {newest.gateway}, which is not there",
+                remedy="bring that gateway back",
+            )
+        async with self._fetched("volume", name, sources, job, accept=accept) as arrival:
+            began = time.monotonic()
+            job.state = "applying"
+            await self._volumes.replace(name, arrival.manifest, arrival.path)
+            self._fetcher.unpacked(job.source, arrival.manifest.size_bytes, time.monotonic() - began)
+        return self._brought(job)
+
+    @contextlib.asynccontextmanager
+    async def _fetched(
+        self, kind: str, name: str, sources: list[str], job: Job, **accept: Callable[[Manifest], str]
+    ) -> AsyncGenerator[Arrival]:
+        """Something fetched whole; when it was put to use it is kept to be given, otherwise for the next try."""
+        arrival = await self._fetcher.fetch(kind, name, sources, job, **accept)
+        try:
+            yield arrival
+        except PayloadError:
+            # Whole and as announced, and yet not what it should be: no part of it is worth keeping.
+            self.refused[f"transfer bad {kind}"] += 1
+            await asyncio.to_thread(arrival.remove)
+            raise
+        else:
+            with contextlib.suppress(OSError):
+                await asyncio.to_thread(self._offers.add, arrival.manifest, arrival.path)
+            await asyncio.to_thread(arrival.remove)
+        finally:
+            await asyncio.to_thread(self._spool.close, arrival)
+
+    def _sources(self, gateways: Iterable[str]) -> list[str]:
+        members = self._plane.members() - {self._plane.gateway}
+        return [each for each in dict.fromkeys(gateways) if each in members]
+
+    def _brought(self, job: Job) -> Brought:
+        return Brought(
+            what=job.what,
+            gateway=job.source,
+            size_bytes=job.size_bytes,
+            wire_bytes=job.wire_bytes,
+            resumed_bytes=job.resumed_bytes,
+        )
+
+    # --- images -----------------------------------------------------------------------------------------------
+
+    async def _bring_image(self, reference: str, first: str, job: Job) -> Brought:
+        listed = [gateway for gateway, status in self._plane.registry.gateways.items() if reference in status.images]
+        sources = self._sources([first, *listed]) or self._sources(sorted(self._plane.members()))
+        problem: SwiftbotError = NotFoundError(
+            f"no gateway that answers has image {reference}", remedy="swiftbot images build"
+        )
+        for source in sources:
+            try:
+                layout = await self._layout(source, reference, job)
+            except (UnreachableError, DeadlineError, NotFoundError, RefusedError, PayloadError) as error:
+                log.info("an image is not to be had there", image=reference, gateway=source, reason=str(error))
+                problem = error if not isinstance(error, NotFoundError) else problem
+                continue
+            others = [source, *(each for each in sources if each != source)]
+            have = await self._storage.layers()
+            try:
+                await self._load(layout, others, job, have=have)
+            except PayloadError as error:
+                problem = error
+                continue
+            await self._look()
+            return self._brought(job)
+        raise problem
+
+    async def _layout(self, source: str, reference: str, job: Job) -> ImageLayout:
+        until = time.monotonic() + self._config.prepare_s
+        job.source = source
+        while time.monotonic() < until:
+            offer = await self._plane.rpc.call(
+                source, "image_layout", ImageAsk(reference=reference), ImageOffer, timeout_s=ANSWER_S + ASK_S
+            )
+            if offer.layout is not None:
+                check_layout(offer.layout, reference)
+                return offer.layout
+            await asyncio.sleep(_PENDING_S)
+        raise DeadlineError(f"{source} did not make image {reference} ready in time")
+
+    async def _load(self, layout: ImageLayout, sources: list[str], job: Job, *, have: frozenset[str]) -> None:
+        """Fetch what is not here and have Podman load it; what Podman then says must be what was announced."""
+        blobs: dict[str, Path] = {}
+        for digest in dict.fromkeys((layout.image_id, *layout.layers)):
+            if digest not in have:
+                blobs[digest] = await self._blob(digest, sources, job)
+        job.state = "applying"
+        config = await asyncio.to_thread(check_config, layout, blobs.pop(layout.image_id))
+        sizes = {digest: path.stat().st_size for digest, path in blobs.items()}
+        await self._storage.load_image(partial(archive, layout, config, blobs, sizes))
+        facts = await self._storage.image(layout.reference)
+        if facts.id != layout.image_id or facts.layers != layout.layers:
+            await self._storage.remove_image(layout.reference)
+            self.refused["transfer bad image"] += 1
+            raise PayloadError(
+                f"Podman loaded image {layout.reference} as {facts.id[:12]}, not as {layout.image_id[:12]}",
+                remedy="look at the gateway that gave it",
+            )
+
+    async def _blob(self, digest: str, sources: list[str], job: Job) -> Path:
+        offer = self._offers.find("blob", digest)
+        if offer is None or await asyncio.to_thread(content_digest, offer.path) != digest:
+            async with self._fetched("blob", digest, sources, job) as arrival:
+                if await asyncio.to_thread(content_digest, arrival.path) != digest:
+                    raise PayloadError(f"blob {digest[:12]} from {job.source} is something else")
+            offer = self._offers.find("blob", digest)
+        if offer is None:
+            raise RefusedError(
+                f"blob {digest[:12]} does not fit among what is kept", remedy="raise pool.transfer.cache_mb"
+            )
+        return offer.path
+
+    async def _keep_looking(self) -> None:
+        while True:
+            await self._look()
+            await asyncio.sleep(_LOOK_S)
+
+    async def _look(self) -> None:
+        with contextlib.suppress(SwiftbotError):
+            tags = {tag for each in await self._storage.images() for tag in each.tags}
+            found = tuple(sorted(tag for tag in tags if tag.startswith(REFERENCE_PREFIX)))
+            if found != self._images:
+                self._images = found
+                self.on_change()
+
+    async def _on_fetch(self, ask: FetchAsk) -> Brought:
+        return await self.bring_image(ask.reference, ask.gateway)
 
     # --- what it costs ----------------------------------------------------------------------------------------
 
     def bandwidth_mbps(self, gateway: str) -> float:
         """Megabits per second measured with a gateway (moving average); a careful guess before there is any."""
-        raise NotImplementedError
+        return self._fetcher.links.get(gateway, Link()).bandwidth * 8 / 1e6
 
     def cost_ms(self, size_bytes: int, gateway: str) -> float:
-        """MigCost without the start: size / bandwidth + serialise + deserialise, milliseconds (algorithms, Phase 2)."""
-        raise NotImplementedError
+        """MigCost without the start: size / bandwidth + serialise + deserialise, ms (algorithms, Phase 2)."""
+        return self._fetcher.links.get(gateway, Link()).cost_ms(size_bytes)
 
     # --- watching ---------------------------------------------------------------------------------------------
 
     def active(self) -> tuple[Progress, ...]:
         """Transfers to this gateway that are under way or wait."""
-        raise NotImplementedError
+        return tuple(self._progress(job) for job in self._jobs.values())
 
     def cancel(self, transfer: str) -> bool:
         """End a transfer by its id; False when there is none. What arrived is kept for the next try."""
-        raise NotImplementedError
+        for what, job in self._jobs.items():
+            if job.id == transfer:
+                self._tasks[what].cancel()
+                return True
+        return False
+
+    async def _on_list(self, _: TransfersAsk) -> TransferList:
+        return TransferList(transfers=self.active())
+
+    async def _on_cancel(self, ask: CancelAsk) -> Cancelled:
+        return Cancelled(cancelled=self.cancel(ask.id))
+
+    def _progress(self, job: Job) -> Progress:
+        return Progress(
+            id=job.id,
+            what=job.what,
+            gateway=self._plane.gateway,
+            state=job.state,
+            source=job.source,
+            done_bytes=job.done_bytes,
+            size_bytes=job.size_bytes,
+            rate_mbps=round(job.rate_bytes_per_s * 8 / 1e6, 3),
+            problem=job.problem,
+        )
+
+    def _tell(self, job: Job) -> None:
+        key = self._plane.keys.transfer(self._plane.gateway, job.id)
+        self._plane.session.put(key, msgspec.json.encode(self._progress(job)))
+
+    async def _keep_telling(self, job: Job) -> None:
+        while True:
+            self._tell(job)
+            await asyncio.sleep(_TELL_S)
