@@ -5,7 +5,6 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 import secrets
 import tarfile
 from collections.abc import AsyncIterator, Callable
@@ -24,7 +23,9 @@ from appliance.pool.volumes import Volumes, podman_name
 class Side:
     """One gateway's plane, volumes and transfers."""
 
-    def __init__(self, plane: Plane, volumes: Volumes, transfers: Transfers, storage: PodmanStorage, fleet: str) -> None:
+    def __init__(
+        self, plane: Plane, volumes: Volumes, transfers: Transfers, storage: PodmanStorage, fleet: str
+    ) -> None:
         self.plane, self.volumes, self.transfers, self.storage, self.fleet = plane, volumes, transfers, storage, fleet
 
     async def folder(self, name: str) -> Path:
@@ -93,9 +94,7 @@ async def open_side(
         PlaneConfig(listen=(listen,), connect=connect), fleet=fleet, gateway=gateway, data_dir=folder
     )
     storage = PodmanStorage(podman)
-    volumes = Volumes(
-        config, fleet=fleet, gateway=gateway, store=plane.store, records=plane.dht, storage=storage
-    )
+    volumes = Volumes(config, fleet=fleet, gateway=gateway, store=plane.store, records=plane.dht, storage=storage)
     transfers = Transfers(config, plane=plane, volumes=volumes, storage=storage, data_dir=folder)
     await volumes.start()
     await transfers.start()
@@ -120,7 +119,7 @@ def tree(folder: Path) -> dict[str, tuple[int, str]]:
     for path in sorted(folder.rglob("*")):
         mode = path.lstat().st_mode
         if path.is_symlink():
-            what = os.readlink(path)
+            what = str(path.readlink())
         else:
             what = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
         found[path.relative_to(folder).as_posix()] = (mode, what)
@@ -158,7 +157,8 @@ def small_image(reference: str, layers: list[dict[str, bytes]]) -> tuple[bytes, 
     named["annotations"] = {"org.opencontainers.image.ref.name": reference}
     index = json.dumps({"schemaVersion": 2, "manifests": [named]}).encode()
     files = {"oci-layout": b'{"imageLayoutVersion":"1.0.0"}', "index.json": index}
-    return _tar(files | {f"blobs/sha256/{digest}": data for digest, data in blobs.items()}), hashlib.sha256(packed).hexdigest()
+    files |= {f"blobs/sha256/{digest}": data for digest, data in blobs.items()}
+    return _tar(files), hashlib.sha256(packed).hexdigest()
 
 
 def _tar(files: dict[str, bytes]) -> bytes:
