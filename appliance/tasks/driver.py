@@ -46,6 +46,8 @@ from appliance.tasks.surroundings import (
 
 log = structlog.get_logger(__name__)
 
+LOOK_AHEAD_S = 5.0
+"""How often what comes is worked out anew while no subtask changes."""
 _LEAST = (RunEventKind.PROGRESS, RunEventKind.PARTIAL, RunEventKind.CHECKPOINT)
 MAX_INBOX = 1000
 """News that may wait for a driver; beyond it progress is dropped, beyond twice that what checks find out anyway."""
@@ -74,6 +76,8 @@ class Driver(Keeper):
         self._waiting: dict[str, str] = {}
         self._orders = Orders(around, self.tell)
         self._partials = Partials()
+        self._hinted_states: tuple[SubtaskState, ...] = ()
+        self._hint_at = 0.0
         self._cancelled_at: float | None = None
         self._cancel_at: dict[str, float] = {}
         self._check_at = time.monotonic() + around.config.check_s
@@ -313,15 +317,15 @@ class Driver(Keeper):
                 )
             case RunEventKind.SUCCEEDED:
                 self._partials.drop(event.subtask)
-                self._take(
-                    self._transition(
-                        TransitionKind.SUCCEEDED,
-                        result=event.result,
-                        duration_ms=event.duration_ms,
-                        choice=choice,
-                        **common,
-                    )
+                succeeded = self._transition(
+                    TransitionKind.SUCCEEDED,
+                    result=event.result,
+                    duration_ms=event.duration_ms,
+                    choice=choice,
+                    **common,
                 )
+                if self._take(succeeded) and event.duration_ms is not None:
+                    self._around.took(target.subtask.skill, event.duration_ms)
             case RunEventKind.FAILED:
                 failure = event.failure or Failure(code="internal", message="the run failed without a reason")
                 self._attempt_failed(target, failure, event.duration_ms)
@@ -372,6 +376,7 @@ class Driver(Keeper):
         if now < self._check_at:
             return
         self._check_at = now + self._around.config.check_s
+        self._look_ahead(now)
         members = self._plane.members()
         asked: list[SubtaskRecord] = []
         for each in machine.active(self.record):
@@ -414,6 +419,20 @@ class Driver(Keeper):
 
     def _written(self) -> None:
         self._orders.go()
+        self._look_ahead(time.monotonic())
+
+    def _look_ahead(self, now: float) -> None:
+        """Have pools told what comes, when subtasks have moved, and now and then since times pass."""
+        states = tuple(each.state for each in self.record.subtasks)
+        waited = SubtaskState.WAITING in self._hinted_states
+        if not (waited or SubtaskState.WAITING in states) or (states == self._hinted_states and now < self._hint_at):
+            return
+        self._hinted_states, self._hint_at = states, now + LOOK_AHEAD_S
+        running_s = {
+            each.subtask.id: now - self._orders.silent_since(each.subtask.id, now)
+            for each in machine.active(self.record)
+        }
+        self._around.plan_moved(self.record, running_s)
 
 
 def _with_failure(target: SubtaskRecord, failure: Failure) -> SubtaskRecord:

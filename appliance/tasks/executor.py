@@ -19,6 +19,7 @@ from appliance.model import (
     Considered,
     Failure,
     Phase,
+    PoolHint,
     RunAccepted,
     RunEvent,
     RunEventKind,
@@ -29,6 +30,7 @@ from appliance.model import (
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
+from appliance.pool.api import Hinted
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import MOST_CONSIDERED, Decision
 from appliance.tasks.api import RunAsk, RunStatus
@@ -345,6 +347,10 @@ class Executor:
             # The coordinator asks after the run, sees that it has ended with nothing, and repeats it.
             log.error("run was not brought to its end", run=run_id, exc_info=error)
         self.on_change()
+
+    async def hint(self, hint: PoolHint) -> Hinted:
+        """Tell the pool here what a plan will need of it."""
+        return await self._pool.verbs.hint(hint)
 
     async def status(self, ask: RunAsk) -> RunStatus:
         """Tell what is known of a run."""

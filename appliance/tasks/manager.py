@@ -11,7 +11,7 @@ import contextlib
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import structlog
@@ -52,6 +52,7 @@ from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_
 from appliance.tasks.checkpoints import read_checkpoint, remove_checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
+from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement, bind, holds, place
 from appliance.tasks.settings import TasksConfig
@@ -93,6 +94,7 @@ class TaskManager:
         """Why the last driver of a task broke."""
         self._final: dict[str, VersionVector] = {}
         """Records of the shard known to be final, which need not be decoded at every sweep."""
+        self._ahead = LookAhead(plane, manifest=self.manifest, likely_place=self._likely_place, tell_here=executor.hint)
         self._closers: list[Callable[[], None]] = []
         self._stopping = False
         self._sweep = asyncio.Event()
@@ -120,6 +122,7 @@ class TaskManager:
         self.plane.on_member_lost.append(self._on_member_lost)
         self.plane.dht.on_ring_change.append(self._sweep.set)
         self.plane.registry.on_change.append(self._on_fact)
+        await self._ahead.durations.load()
         self._sweeper = asyncio.create_task(self._keep_sweeping(), name="task takeover")
         self._sweep.set()
 
@@ -141,6 +144,7 @@ class TaskManager:
         for each in tasks:
             each.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await self._ahead.close()
 
     # --- submission -----------------------------------------------------------------------------------------
 
@@ -376,6 +380,18 @@ class TaskManager:
         if gateway == self.plane.gateway:
             return await self._executor.run(request)
         return await self.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=self.config.run_timeout_s)
+
+    def plan_moved(self, record: TaskRecord, running_s: Mapping[str, float]) -> None:
+        """Tell pools what the subtasks that are not ready will need."""
+        self._ahead.plan_moved(record, running_s)
+
+    def _likely_place(self, record: TaskRecord, target: SubtaskRecord) -> str:
+        robot = self.bind(record, target)[0] if target.subtask.robot else None
+        return next(iter(self.place(record, target, robot).order), "")
+
+    def took(self, skill: str, duration_ms: float) -> None:
+        """Note how long a run that succeeded took."""
+        self._ahead.durations.add(skill, duration_ms / 1e3)
 
     async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
         """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""

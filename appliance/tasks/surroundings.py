@@ -1,5 +1,6 @@
 """What a driver needs of its gateway, and what it is told: the seam between driving a task and the world."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from msgspec import Struct
@@ -36,6 +37,14 @@ class Surroundings(Protocol):
 
     async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
         """Send a run order, to this gateway without a detour."""
+        ...
+
+    def plan_moved(self, record: TaskRecord, running_s: Mapping[str, float]) -> None:
+        """Tell pools what the subtasks that are not ready will need; `running_s`: how long each active one has."""
+        ...
+
+    def took(self, skill: str, duration_ms: float) -> None:
+        """Note how long a run that succeeded took."""
         ...
 
     async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:

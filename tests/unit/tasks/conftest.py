@@ -335,6 +335,8 @@ class FakeSurroundings:
         self.orders: asyncio.Queue[tuple[str, RunRequest]] = asyncio.Queue()
         self.refusals: list[Exception] = []
         self.passed_to = ""
+        self.moved: list[tuple[tuple[str, ...], dict[str, float]]] = []
+        self.durations: list[tuple[str, float]] = []
         self.checkpoints: dict[str, dict[str, Any]] = {}
         self.forgotten: list[str] = []
         self.choice: Choice | None = None
@@ -362,6 +364,14 @@ class FakeSurroundings:
         """Gateways in order, those where it failed last."""
         failed = {each.gateway for each in target.attempts if each.failure}
         return Placement(order=tuple(sorted(self.places, key=lambda each: each in failed)), why="none is there")
+
+    def plan_moved(self, record: TaskRecord, running_s: Mapping[str, float]) -> None:
+        """Remember the states told."""
+        self.moved.append((tuple(str(each.state) for each in record.subtasks), dict(running_s)))
+
+    def took(self, skill: str, duration_ms: float) -> None:
+        """Remember."""
+        self.durations.append((skill, duration_ms))
 
     async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
         """Return the prepared checkpoint."""

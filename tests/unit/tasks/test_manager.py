@@ -9,8 +9,9 @@ from msgspec.structs import replace
 
 from appliance.client import _news
 from appliance.errors import DeadlineError, PayloadError, UnreachableError
-from appliance.model import RunEvent, RunEventKind, Site, Subtask, TaskRequest, TaskState, encode
+from appliance.model import PoolHint, RunEvent, RunEventKind, Site, Subtask, TaskRequest, TaskState, encode
 from appliance.plane.dht import Record
+from appliance.pool.api import Hinted
 from appliance.tasks import manager as module
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.manager import TaskManager
@@ -25,6 +26,10 @@ class FakeExecutor:
         """Never answer."""
         await asyncio.Event().wait()
         return request
+
+    async def hint(self, hint: PoolHint) -> Hinted:
+        """Follow no hint."""
+        return Hinted(taken=False, why=f"no pool for {hint.image}")
 
 
 @pytest.fixture
