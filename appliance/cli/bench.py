@@ -187,7 +187,7 @@ def bench_plan(*, cases: Path | None = None, limit: int = 0, as_json: Json = Fal
 def dht(
     *,
     sizes: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (16, 64, 256, 1000, 4096, 10_000),
-    lookups: int = 4000,
+    lookups: int = 2000,
     seconds: float = 20.0,
     seed: int = 1,
     part: Literal["all", "simulation", "live"] = "all",

@@ -3,7 +3,7 @@
 import asyncio
 import signal
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import uvloop
@@ -17,7 +17,7 @@ sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
 
 def add_to(app: App) -> None:
     """Add these commands."""
-    for command in (gateway, record):
+    for command in (gateway, router, record):
         app.command(command, group=DAEMONS)
     app.command(sim_app)
 
@@ -34,6 +34,36 @@ def gateway(*, config: Path) -> int:
     loaded = configuration.load(config)
     logs.configure(level=loaded.log_level, style=loaded.log_format)
     uvloop.run(daemon.run(loaded))
+    return 0
+
+
+def router(
+    *,
+    listen: tuple[str, ...] = ("tcp/[::]:7447",),
+    connect: tuple[str, ...] = (),
+    log_format: Literal["json", "text"] = "json",
+) -> int:
+    """Run a router until SIGTERM or Ctrl-C: for fleets too large for links from each gateway to each.
+
+    Gateways become its clients by `mode = "client"` and `connect` in their [plane] section; it needs no place in the
+    fleet and routes for all fleets.
+
+    Args:
+        listen: Endpoint to accept links on; may be given several times.
+        connect: Endpoint of another router to keep linked to; may be given several times. A line or star of three to
+            five routers is enough.
+        log_format: json for journald and machines, text for a terminal.
+    """
+    from appliance.plane.router import run_router
+    from appliance.plane.settings import PlaneConfig
+
+    logs.configure(style=log_format)
+
+    async def go() -> None:
+        plane = PlaneConfig(mode="router", listen=listen, connect=connect)
+        await run_router(plane, stop=_until_signalled(), ready=lambda _: service.ready(), alive=service.alive)
+
+    uvloop.run(go())
     return 0
 
 

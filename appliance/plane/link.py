@@ -94,6 +94,8 @@ def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
         "transport/link/tx/keep_alive": 4,
         # A peer that takes nothing for a lease is as good as dead: its link is closed and the sender goes on.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": config.lease_ms * 1000,
+        # Zenoh's own 1,000 is less than a large fleet with its robots and clients on one router.
+        "transport/unicast/max_sessions": 10_000 if config.mode == "router" else 1000,
         "transport/link/rx/max_message_size": config.max_payload_bytes * _WIRE_HEADROOM,
         "transport/unicast/open_timeout": 3000,
         "transport/unicast/accept_timeout": 3000,

@@ -14,7 +14,8 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Zenoh session, ring and store of one process."""
 
     mode: Literal["peer", "client", "router"] = "peer"
-    """`peer`: a few gateways, full mesh by gossip. `client`: everybody else, and large fleets behind routers."""
+    """`peer`: a few gateways, full mesh by gossip. `client`: everybody else, and the gateways of a fleet of more than
+    about thirty, which link to one of the routers in `connect` (`swiftbot router`). `router`: routes for clients."""
     listen: tuple[str, ...] = ()
     """Endpoints to accept links on, such as `tcp/0.0.0.0:7447`; empty: accept none."""
     connect: tuple[str, ...] = ()
@@ -66,6 +67,10 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                     _check_port(name, endpoint, address)
         if self.mode == "client" and not self.connect:
             raise ConfigError("plane.connect is empty", remedy="a client needs an endpoint of a gateway or router")
+        if self.mode == "client" and self.listen:
+            raise ConfigError(
+                "plane.listen is set, but a client accepts no links", remedy="empty it, or set plane.mode to peer"
+            )
         for name, least in _LEAST.items():
             if getattr(self, name) < least:
                 raise ConfigError(f"plane.{name} is {getattr(self, name)}", remedy=f"at least {least}")

@@ -11,8 +11,8 @@ from msgspec import Struct
 from appliance.plane.overlay.view import Step, View
 from appliance.plane.ring import RING_SIZE, point
 
-MOST_ASKED = 64
-"""Questions of one lookup, dead members included: ten times what a ring of a million members needs."""
+MOST_ASKED = 128
+"""Questions of one lookup, dead members included: twenty times what a ring of a million members needs."""
 
 
 class NextAsk(Struct, frozen=True, omit_defaults=True):

@@ -83,7 +83,7 @@ def test_arbitrary_answers_end_a_lookup(
     view = View("me", bound=16)
     view.hear(["gw1", "gw2", "gw3"])
     lookup = Lookup(target, view)
-    for alive, mine, owners, closer in 10 * answers + 60 * answers[:1]:
+    for alive, mine, owners, closer in 20 * answers + 120 * answers[:1]:
         name = lookup.next()
         if name is None:
             break
