@@ -17,8 +17,8 @@ from appliance.llm.corpus.tally import tally
 from appliance.model import Subtask
 from appliance.skills.catalogue import DOMAINS, Catalogue
 
-LEAST_OF_A_SKILL = 5
-LEAST_OF_A_DOMAIN = 15
+LEAST_OF_A_SKILL = 9
+LEAST_OF_A_DOMAIN = 20
 
 _LINE = st.text(st.characters(blacklist_categories=("Cc", "Cs"), blacklist_characters="\u2028\u2029"), max_size=30)
 _NAME = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
