@@ -19,7 +19,7 @@ import structlog
 
 from appliance import logs, service
 from appliance.config import GatewayConfig
-from appliance.errors import ConfigError, SwiftbotError
+from appliance.errors import ConfigError, RefusedError, SwiftbotError
 from appliance.llm.cascade import Decomposer
 from appliance.model import (
     ContainerInfo,
@@ -30,15 +30,17 @@ from appliance.model import (
     PoolHint,
     RunRequest,
     Site,
+    TaskRecord,
     TaskRequest,
 )
 from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.pool import Call, Pool
+from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
-from appliance.tasks.api import ArtifactAsk, RunAsk
+from appliance.tasks.api import ArtifactAsk, RunAsk, TaskAsk
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
@@ -98,6 +100,7 @@ class Gateway:
             gateway=config.id,
             site=site,
             on_task=self._on_robot_task,
+            tasks=Tasks(submit=self._submit_for_robot, cancel=self._cancel_for_robot),
         )
         await self.hub.start()
         self._stack.push_async_callback(self.hub.stop)
@@ -229,6 +232,19 @@ class Gateway:
         except Exception as error:  # the boundary to what a robot sent: it is told in the log, and counted
             log.exception("a robot's task broke", robot=robot)
             self._refuse_intake(robot, f"{type(error).__name__}: {error}")
+
+    async def _submit_for_robot(self, request: TaskRequest) -> TaskRecord:
+        """Hand in a task by MAVLink; durable when this returns."""
+        self._check_ready()
+        return await self.manager.submit(request)
+
+    async def _cancel_for_robot(self, task: str) -> TaskRecord:
+        self._check_ready()
+        return await self.manager.cancel(TaskAsk(id=task))
+
+    def _check_ready(self) -> None:
+        if not self._ready.is_set() or self._draining:
+            raise RefusedError(f"{self.config.id} is {'draining' if self._draining else 'starting'}")
 
     def _refuse_intake(self, robot: str, reason: str) -> None:
         self.plane.session.refused["robot task"] = self.plane.session.refused.get("robot task", 0) + 1

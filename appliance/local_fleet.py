@@ -34,7 +34,7 @@ from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.record.settings import RecordConfig
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import MavlinkLink
 
 Progress = Callable[[str], None]
 
@@ -252,7 +252,7 @@ class _Starting:
                 connect=tuple(endpoint for at, endpoint in enumerate(endpoints) if at != index),
             ),
             pool=self._order.pool_of(name),
-            robots=RobotsConfig(mavlink=links),
+            robots=msgspec.structs.replace(base.robots, mavlink=links),
             record=RecordConfig(directory=str(record_dir)),
         )
 

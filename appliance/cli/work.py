@@ -1,4 +1,4 @@
-"""Work with a fleet: `swiftbot submit`, `plan`, `task …`, `fleet`, `robots`, `tui`."""
+"""Work with a fleet: `swiftbot submit`, `plan`, `task …`, `fleet`, `tui`."""
 
 import asyncio
 import os
@@ -19,7 +19,7 @@ task_app = App(name="task", help="List, show and cancel tasks.", group=WORK)
 
 def add_to(app: App) -> None:
     """Add these commands."""
-    for command in (plan, submit, fleet, robots, tui):
+    for command in (plan, submit, fleet, tui):
         app.command(command, group=WORK)
     app.command(task_app)
 
@@ -150,19 +150,6 @@ def fleet(*, as_json: Json = False, where: Where = HERE) -> int:
             await client.gateway()
             found = sorted(client.plane.registry.gateways.values(), key=lambda each: each.id)
         show(found, as_json=as_json, table=console.gateway_table(found))
-
-    asyncio.run(go())
-    return 0
-
-
-def robots(*, as_json: Json = False, where: Where = HERE) -> int:
-    """Show the robots."""
-
-    async def go() -> None:
-        async with FleetClient(where.endpoint()) as client:
-            await client.gateway()
-            found = sorted(client.plane.registry.robots.values(), key=lambda each: each.id)
-        show(found, as_json=as_json, table=console.robot_table(found))
 
     asyncio.run(go())
     return 0

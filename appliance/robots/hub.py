@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from appliance.model import Site, TaskRequest
 from appliance.plane.session import Session
+from appliance.robots.doors import Tasks
 from appliance.robots.intake import TaskIntake
 from appliance.robots.ledger import KeyValues
 from appliance.robots.settings import RobotsConfig
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class RobotHub:
-    """One per gateway. `refused` counts bad input by kind."""
+    """One per gateway. `refused` counts bad input by kind; `on_task` and `tasks` take what robots ask for."""
 
     def __init__(
         self,
@@ -28,12 +29,14 @@ class RobotHub:
         gateway: str,
         site: Site,
         on_task: Callable[[str, TaskRequest], None] | None = None,
+        tasks: Tasks | None = None,
     ) -> None:
         self._config = config
         self._session = session
         self._store = store
         self._gateway = gateway
         self._site = site
+        self._tasks = tasks
         self.refused: dict[str, int] = {}
         self._intake = None if on_task is None else TaskIntake(session, on_task, self.refused)
         self._station: Station | None = None
@@ -57,6 +60,7 @@ class RobotHub:
                 gateway=self._gateway,
                 site=self._site,
                 refused=self.refused,
+                tasks=self._tasks,
             )
             await station.start()
             self._station = station

@@ -5,6 +5,7 @@ or it connects to what listens itself.
 Every figure that decides how long something is waited for is here and nowhere else.
 """
 
+import re
 from typing import Literal
 from urllib.parse import urlsplit
 
@@ -14,6 +15,9 @@ from appliance.errors import ConfigError, PayloadError
 from appliance.plane.keys import check_name
 
 MAX_SYSTEM = 255
+MAX_TEMPLATE = 500
+_PLACEHOLDER = re.compile(r"\{(.*?)\}")
+_KNOWN_PLACES = frozenset({"robot", *"234567"})
 
 
 DEFAULT_LISTEN = "udp://127.0.0.1:14550"
@@ -85,11 +89,39 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             _check_robot_name(f"{self.prefix}{MAX_SYSTEM}")
 
 
+class Template(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A task that a MAVLink command asks for by number (MAV_CMD_USER_1, param1)."""
+
+    id: int
+    """1 to 65535."""
+    instruction: str
+    """What to do; `{robot}` is the vehicle that asks or is addressed, `{2}` to `{7}` are the command's parameters."""
+    label: str = ""
+    """What a ground station's button says; the instruction where empty."""
+
+    def check(self) -> None:
+        """Raise ConfigError for what cannot be asked for."""
+        if not 1 <= self.id <= 65_535:
+            raise ConfigError(f"robots.templates: id {self.id}", remedy="use 1 to 65535")
+        if not self.instruction.strip() or len(self.instruction) > MAX_TEMPLATE:
+            raise ConfigError(
+                f"robots.templates {self.id}: an instruction of {len(self.instruction)} characters",
+                remedy=f"write 1 to {MAX_TEMPLATE}",
+            )
+        unknown = [each for each in _PLACEHOLDER.findall(self.instruction) if each not in _KNOWN_PLACES]
+        if unknown:
+            raise ConfigError(
+                f"robots.templates {self.id}: {{{unknown[0]}}} stands for nothing", remedy="use {robot}, {2} to {7}"
+            )
+
+
 class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the robots room; times in seconds."""
 
     mavlink: tuple[MavlinkLink, ...] = ()
     """None: this gateway has no MAVLink vehicles of its own."""
+    templates: tuple[Template, ...] = ()
+    """Tasks that MAVLink commands may ask for; `swiftbot robots qgc-actions` makes QGroundControl's buttons of them."""
     route: bool = True
     """Pass frames on between links and ends, as MAVLink routers do: a ground station on one link then sees and
     commands the vehicles of the others. Off: the gateway alone speaks to its vehicles."""
@@ -125,6 +157,11 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             if link.remote in remotes:
                 raise ConfigError(f"robots.mavlink: {link.remote} is given twice", remedy="one link per address")
             remotes.add(link.remote)
+        for template in self.templates:
+            template.check()
+        numbers = [each.id for each in self.templates]
+        if len(set(numbers)) < len(numbers):
+            raise ConfigError("robots.templates: an id is given twice", remedy="give each its own")
         if not 1 <= self.system_id <= MAX_SYSTEM:
             raise ConfigError(f"robots.system_id {self.system_id} is not a MAVLink system id", remedy="use 1 to 255")
 

@@ -14,14 +14,19 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
+from pymavlink import mavutil
 
+from appliance import config as configuration
 from appliance import local_fleet
 from appliance.client import FleetClient
+from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, NotFoundError
 from appliance.local_fleet import FleetState, Order
 from appliance.model import ContainerState, Phase, RobotCommand, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
+from appliance.robots.mavlink.requests import task_number
+from appliance.robots.settings import RobotsConfig, Template
 from appliance.tasks.replay import replay
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
@@ -44,6 +49,54 @@ async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
         yield state
     finally:
         await local_fleet.down(order.directory, progress=print)
+
+
+async def test_a_task_by_mavlink(tmp_path: Path) -> None:
+    """A ground station's button makes a task of the vehicle it addresses: acknowledged when durable, told to its end.
+
+    The repeated command is the same task, and the vehicle flies once.
+    """
+    template = Template(id=7, instruction="{robot}: take off, then land")
+    order = Order(
+        fleet=f"t{os.getpid()}-{time.monotonic_ns() % 100000}",
+        directory=tmp_path / "fleet",
+        sim_rate=4.0,
+        zenoh=0,
+        pool=PoolConfig(floor={"base": 1}),
+        base=GatewayConfig(id="gw-1", robots=RobotsConfig(templates=(template,))),
+    )
+    state = await local_fleet.up(order, progress=print, timeout_s=90.0)
+
+    def station() -> tuple[list[tuple[int, int]], list[str]]:
+        link = configuration.load(order.directory / "gw-1" / "gateway.toml").robots.mavlink[0]
+        ground = mavutil.mavlink_connection(link.listen.replace("udp://", "udpout:"), 255, source_component=190)
+        answers: list[tuple[int, int]] = []
+        texts: list[str] = []
+        try:
+            for confirmation in (0, 1):
+                ground.mav.heartbeat_send(6, 8, 0, 0, 4)
+                ground.mav.command_long_send(1, 191, 31010, confirmation, 7, 0, 0, 0, 0, 0, 0)
+                while not answers or answers[-1][0] != 0 or len(answers) < 2 + confirmation:
+                    found = ground.recv_match(type="COMMAND_ACK", blocking=True, timeout=30)
+                    answers.append((found.result, found.result_param2))
+            while not any("succeeded" in text for text in texts):
+                texts.append(ground.recv_match(type="STATUSTEXT", blocking=True, timeout=60).text)
+        finally:
+            ground.close()
+        return answers, texts
+
+    try:
+        answers, texts = await asyncio.to_thread(station)
+        task = texts[-1].split()[0]
+        assert [result for result, _ in answers] == [5, 0, 0]
+        assert answers[1] == answers[2] == (0, task_number(task))
+        async with FleetClient(state.endpoint) as client:
+            record = await client.task(task)
+        assert (record.instruction, record.submitter) == ("drone_1: take off, then land", "drone_1")
+        assert record.state is TaskState.SUCCEEDED
+    finally:
+        await local_fleet.down(order.directory, progress=print)
+    assert set(commands_in(state, task).values()) == {1}
 
 
 async def wait_for(client: FleetClient, task: str) -> TaskRecord:

@@ -59,8 +59,12 @@ class Codec:
         self.signer = signer
         self._clock = clock
 
-    def pack(self, message: Message) -> bytes:
-        """Encode a message as a MAVLink 2 frame with the next sequence number."""
+    def pack(self, message: Message, *, system: int | None = None) -> bytes:
+        """Encode a message as a MAVLink 2 frame with the next sequence number.
+
+        `system` is another than the gateway's own when it speaks as a vehicle's onboard computer.
+        """
+        self._mav.srcSystem = self.system if system is None else system
         raw = bytes(message.pack(self._mav))
         if self.signer is not None:
             raw = self._sign(raw, message)

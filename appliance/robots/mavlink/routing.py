@@ -88,6 +88,10 @@ class Router:
         """Ends heard lately."""
         return tuple(self._ends)
 
+    def knows(self, system: int, component: int) -> bool:
+        """Whether that very component has been heard."""
+        return (system, component) in self._routes
+
     def repeated(self, raw: bytes, now: float) -> bool:
         """Whether these bytes came just before; notes that they came now. Bounded by the time, and by 8192 frames."""
         while self._seen:

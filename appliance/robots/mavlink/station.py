@@ -15,14 +15,16 @@ import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
-from appliance.model import Failure, Site, encode
+from appliance.model import Failure, Site, TaskRecord, encode
 from appliance.plane.session import Closer, Session
 from appliance.robots.commands import CommandDesk
+from appliance.robots.doors import Tasks
 from appliance.robots.ledger import KeyValues, Ledger
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.copter import Copter
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Address, Link, open_link
+from appliance.robots.mavlink.requests import RequestDesk
 from appliance.robots.mavlink.routing import BROADCAST, End, Passage, Router, Rules
 from appliance.robots.mavlink.signing import Memory, Signer, read_key
 from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
@@ -71,6 +73,7 @@ class Station:
         gateway: str,
         site: Site,
         refused: dict[str, int],
+        tasks: Tasks | None = None,
     ) -> None:
         self._config = config
         self._session = session
@@ -95,6 +98,8 @@ class Station:
             for link in config.mavlink
         ]
         self._router = Router(rules, own_system=config.system_id)
+        self._requests = RequestDesk(config.templates, tasks=tasks, store=store, refused=refused)
+        self._records: Closer | None = None
         self._others: set[str] = set()
         self._watch: Closer | None = None
         self._ticking: asyncio.Task[None] | None = None
@@ -116,6 +121,8 @@ class Station:
         except SwiftbotError:
             await self.stop()
             raise
+        await self._requests.load()
+        self._records = self._session.subscribe_typed(self._session.keys.task(), TaskRecord, self._on_record)
         self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
         self._ticking = asyncio.create_task(self._tick(), name="robot hub")
 
@@ -147,6 +154,10 @@ class Station:
                 with contextlib.suppress(asyncio.CancelledError):
                     await task
         self._ticking = None
+        await self._requests.close()
+        if self._records is not None:
+            self._records.close()
+            self._records = None
         for each in self._vehicles.values():
             await each.desk.close()
             for closer in (each.queryable, each.token):
@@ -180,7 +191,8 @@ class Station:
             return
         each = self._by_source.get((index, frame.system))
         if each is None and self._is_guest(index, frame):
-            self._route(frame, End(index, address), now)
+            if not self._ask(frame, End(index, address), None):
+                self._route(frame, End(index, address), now)
             return
         if each is None:
             each = self._welcome(index, link, frame, address)
@@ -196,7 +208,41 @@ class Station:
             each.tell = True
         self._session.put(self._session.keys.mavlink(vehicle.name, "rx"), frame.raw, encoding=FRAME_ENCODING)
         self._see(each, now)
-        self._route(frame, End(index, address), now)
+        if not self._ask(frame, End(index, address), each):
+            self._route(frame, End(index, address), now)
+
+    def _ask(self, frame: Frame, source: End, sender: _Attached | None) -> bool:
+        """Take a command for the gateway as an onboard computer: of its own system, or of a vehicle's.
+
+        Ground stations know vehicles, not gateways: their buttons address component 191 of the vehicle's system. Where
+        a real companion computer has that number, the command is its.
+        """
+        if frame.name not in ("COMMAND_LONG", "COMMAND_INT"):
+            return False
+        system, component = frame.message.target_system, frame.message.target_component
+        if component != self._config.component_id:
+            return False
+        robot = "" if sender is None else sender.vehicle.name
+        if system != self._config.system_id:
+            addressed = [each for each in self._vehicles.values() if each.vehicle.system == system]
+            if len(addressed) != 1 or self._router.knows(system, component):
+                return False
+            robot = addressed[0].vehicle.name
+
+        def reply(message: Message) -> None:
+            if source.link < len(self._links):
+                raw = self._links[source.link].send(message, source.address, system=system)
+                if sender is not None:
+                    name = sender.vehicle.name
+                    self._session.put(self._session.keys.mavlink(name, "tx"), raw, encoding=FRAME_ENCODING)
+
+        self._requests.take(frame, robot=robot, reply=reply)
+        return True
+
+    def _on_record(self, key: str, record: TaskRecord | None) -> None:
+        del key
+        if record is not None:
+            self._requests.news(record)
 
     def _is_guest(self, index: int, frame: Frame) -> bool:
         """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer."""

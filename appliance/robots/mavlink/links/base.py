@@ -49,9 +49,9 @@ class Link(abc.ABC):
     async def close(self) -> None:
         """Close everything; a port is free when it returns."""
 
-    def send(self, message: Message, to: Address) -> bytes:
-        """Send one message and return its frame."""
-        raw = self.codec.pack(message)
+    def send(self, message: Message, to: Address, *, system: int | None = None) -> bytes:
+        """Send one message and return its frame; `system` as in `Codec.pack`."""
+        raw = self.codec.pack(message, system=system)
         self.transmit(raw, to)
         return raw
 

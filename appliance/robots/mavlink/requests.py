@@ -1,0 +1,285 @@
+"""Tasks asked for by MAVLink command: MAV_CMD_USER_1 with a template's number and arguments.
+
+A ground station's button or a vehicle's script sends COMMAND_LONG (or COMMAND_INT) to component 191, of the gateway's
+system or of a vehicle's: param1 is the template, param2 to param7 its arguments. The answers are COMMAND_ACKs:
+
+    IN_PROGRESS             it is being handed in
+    ACCEPTED                the task is durable on its replicas; result_param2 is its number (`task_number`)
+    TEMPORARILY_REJECTED    the fleet takes none just now, or this sender's last one has not been answered yet
+    DENIED                  it cannot be; a STATUSTEXT tells why
+    UNSUPPORTED             another command
+
+MAV_CMD_USER_2 cancels the sender's last task (pymavlink's dialects have no COMMAND_CANCEL). COMMAND_ACK answers by
+command alone, so a sender has one outstanding; a repetition (`confirmation` above 0) of the last one gets the last
+answer, also from a gateway that was restarted in between. How the task goes on is told by STATUSTEXT.
+"""
+
+import asyncio
+import math
+import secrets
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import structlog
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.model import TaskRecord, TaskRequest, TaskState, encode
+from appliance.robots.doors import Tasks
+from appliance.robots.ledger import KeyValues
+from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink.dialect import Frame, Message
+from appliance.robots.settings import Template
+
+log = structlog.get_logger(__name__)
+
+ASK, CANCEL = dialect.constant("MAV_CMD_USER_1"), dialect.constant("MAV_CMD_USER_2")
+PREFIX = "mavlink/request/"
+"""Of the senders' last requests in the gateway's store."""
+MAX_SENDERS = 64
+"""Whose last request is remembered; the longest silent is forgotten first."""
+_TEXT = 50
+"""Characters of a STATUSTEXT."""
+_INFO, _NOTICE, _ERROR = 6, 5, 3
+_PASSING = (RefusedError, UnreachableError, DeadlineError)
+"""Errors after which it may be asked again."""
+
+
+class Asked(Struct, kw_only=True):
+    """A sender's last request, kept over a restart. `result` is None until it is answered."""
+
+    parameters: tuple[float, ...]
+    task: str
+    result: int | None = None
+    why: str = ""
+
+
+def task_number(task: str) -> int:
+    """Return the 31-bit number by which MAVLink names a task: the CRC-32 of its id, without the sign."""
+    return zlib.crc32(task.encode()) & 0x7FFF_FFFF
+
+
+def instruction(template: Template, parameters: tuple[float, ...], *, robot: str) -> str:
+    """Return a template's text with `{robot}` and `{2}` to `{7}` filled in.
+
+    Args:
+        template: what is asked for.
+        parameters: param1 to param7.
+        robot: the vehicle that asks or is addressed; empty for a ground station that addresses the gateway itself.
+
+    Raises:
+        PayloadError: it needs a robot and there is none, or a number that is no number.
+    """
+    if "{robot}" in template.instruction and not robot:
+        raise PayloadError(f"template {template.id} needs a vehicle", remedy="send it to component 191 of the vehicle")
+    text = template.instruction.replace("{robot}", robot)
+    for place in range(2, 8):
+        if f"{{{place}}}" in text:
+            value = parameters[place - 1]
+            if not math.isfinite(value):
+                raise PayloadError(f"template {template.id} needs a number as param{place}")
+            text = text.replace(f"{{{place}}}", f"{value:.7f}".rstrip("0").rstrip("."))
+    return text
+
+
+def parameters_of(message: Message) -> tuple[float, ...]:
+    """Return param1 to param7 of a COMMAND_LONG, or of a COMMAND_INT, whose x and y are degrees times 1e7."""
+    if message.get_type() == "COMMAND_INT":
+        place = (message.x / 1e7, message.y / 1e7, message.z)
+        return (message.param1, message.param2, message.param3, message.param4, *place)
+    return tuple(float(getattr(message, f"param{number}")) for number in range(1, 8))
+
+
+class RequestDesk:
+    """Takes requests and answers them.
+
+    Args:
+        templates: what may be asked for.
+        tasks: the fleet's tasks; None where this gateway takes none, which is answered so.
+        store: keeps each sender's last request.
+        refused: counters of bad input.
+    """
+
+    def __init__(
+        self, templates: tuple[Template, ...], *, tasks: Tasks | None, store: KeyValues, refused: dict[str, int]
+    ) -> None:
+        self._templates = {each.id: each for each in templates}
+        self._tasks = tasks
+        self._store = store
+        self._refused = refused
+        self._last: OrderedDict[str, Asked] = OrderedDict()
+        self._at_work: dict[str, asyncio.Task[None]] = {}
+        self._follow: dict[str, tuple[Callable[[Message], None], str]] = {}
+
+    async def load(self) -> None:
+        """Read what was asked for before a restart."""
+        for key, value in await self._store.scan(PREFIX):
+            try:
+                self._last[key.removeprefix(PREFIX)] = msgspec.json.decode(value, type=Asked)
+            except msgspec.DecodeError as error:
+                log.warning("a kept request cannot be read and is dropped", key=key, reason=str(error))
+                await self._store.delete(key)
+
+    async def close(self) -> None:
+        """Stop; what is being handed in is asked again by its sender."""
+        for task in list(self._at_work.values()):
+            task.cancel()
+        await asyncio.gather(*self._at_work.values(), return_exceptions=True)
+
+    def take(self, frame: Frame, *, robot: str, reply: Callable[[Message], None]) -> None:
+        """Take a command that is for this gateway.
+
+        Args:
+            frame: COMMAND_LONG or COMMAND_INT.
+            robot: the vehicle that sent it or is addressed by it; empty for none.
+            reply: sends a message back to the sender, as the component it addressed.
+        """
+        message = frame.message
+        sender = f"{frame.system}-{frame.component}"
+        if message.command not in (ASK, CANCEL):
+            self._count("command_unsupported")
+            self._answer(frame, reply, dialect.UNSUPPORTED)
+            return
+        if sender in self._at_work:
+            # A repetition while it is being handed in hears the same; anything else has to wait its turn.
+            same = message.command == ASK and self._last[sender].parameters == parameters_of(message)
+            self._answer(frame, reply, dialect.IN_PROGRESS if same else dialect.TEMPORARILY_REJECTED)
+            return
+        last = self._last.get(sender)
+        repeated = bool(getattr(message, "confirmation", 0)) and last is not None
+        if message.command == ASK and repeated and last is not None and last.parameters == parameters_of(message):
+            if last.result is not None:
+                self._reply(frame, reply, last)
+                return
+            work = self._hand_in(sender, frame, reply, last, robot)  # a gateway before this one did not come to answer
+        elif message.command == ASK:
+            work = self._begin(sender, frame, reply, robot)
+        else:
+            work = self._cancel(frame, reply, last)
+        self._at_work[sender] = task = asyncio.create_task(work, name=f"MAVLink request of {sender}")
+        task.add_done_callback(lambda _: self._at_work.pop(sender, None))
+
+    # --- asking ------------------------------------------------------------------------------------------------
+
+    async def _begin(self, sender: str, frame: Frame, reply: Callable[[Message], None], robot: str) -> None:
+        asked = Asked(parameters=parameters_of(frame.message), task=f"m-{secrets.token_hex(6)}")
+        self._last[sender] = asked
+        self._last.move_to_end(sender)
+        while len(self._last) > MAX_SENDERS:
+            silent, _ = self._last.popitem(last=False)
+            await self._store.delete(PREFIX + silent)
+        await self._hand_in(sender, frame, reply, asked, robot)
+
+    async def _hand_in(
+        self, sender: str, frame: Frame, reply: Callable[[Message], None], asked: Asked, robot: str
+    ) -> None:
+        self._answer(frame, reply, dialect.IN_PROGRESS)
+        try:
+            request = self._request(asked, robot=robot, sender=sender)
+            # Kept before it is handed in: whoever repeats it after a crash here asks for the same task.
+            await self._store.put(PREFIX + sender, encode(asked))
+            self._follow[asked.task] = (reply, "")
+            if self._tasks is None:
+                raise PayloadError("this gateway takes no tasks")
+            await self._tasks.submit(request)
+            asked.result = dialect.ACCEPTED
+            log.info("task by MAVLink", task=asked.task, sender=sender, instruction=request.instruction)
+        except SwiftbotError as error:
+            passing = isinstance(error, _PASSING)
+            asked.result = dialect.TEMPORARILY_REJECTED if passing else dialect.DENIED
+            asked.why = error.message
+            self._follow.pop(asked.task, None)
+            self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
+            log.warning("task by MAVLink is refused", sender=sender, reason=str(error))
+        try:
+            if asked.result == dialect.TEMPORARILY_REJECTED:
+                await self._store.delete(PREFIX + sender)
+                self._last.pop(sender, None)  # a repetition is to be tried again
+            else:
+                await self._store.put(PREFIX + sender, encode(asked))
+        except SwiftbotError as error:
+            log.warning("the answer to a request could not be kept", sender=sender, reason=str(error))
+        self._reply(frame, reply, asked)
+
+    def _request(self, asked: Asked, *, robot: str, sender: str) -> TaskRequest:
+        number = asked.parameters[0]
+        template = self._templates.get(int(number)) if math.isfinite(number) else None
+        if template is None:
+            known = ", ".join(str(each) for each in sorted(self._templates)) or "none"
+            raise PayloadError(f"no template {number:g}; known: {known}", remedy="add it to robots.templates")
+        text = instruction(template, asked.parameters, robot=robot)
+        return TaskRequest(instruction=text, id=asked.task, submitter=robot or f"mavlink-{sender}")
+
+    async def _cancel(self, frame: Frame, reply: Callable[[Message], None], last: Asked | None) -> None:
+        if last is None or self._tasks is None:
+            self._say(reply, "no task of yours is known here", _ERROR)
+            self._answer(frame, reply, dialect.DENIED)
+            return
+        self._answer(frame, reply, dialect.IN_PROGRESS)
+        try:
+            record = await self._tasks.cancel(last.task)
+        except NotFoundError as error:
+            self._say(reply, error.message, _ERROR)
+            self._answer(frame, reply, dialect.DENIED)
+        except SwiftbotError as error:
+            self._say(reply, error.message, _ERROR)
+            self._answer(frame, reply, dialect.TEMPORARILY_REJECTED)
+        else:
+            ended = record.state.final and record.state is not TaskState.CANCELLED
+            if ended:
+                self._say(reply, f"{last.task} had {record.state} already", _NOTICE)
+            self._answer(frame, reply, dialect.DENIED if ended else dialect.ACCEPTED, number=task_number(last.task))
+
+    # --- telling -----------------------------------------------------------------------------------------------
+
+    def news(self, record: TaskRecord) -> None:
+        """Tell a task's sender how it goes on: its state, how many subtasks are done, and in the end why."""
+        found = self._follow.get(record.id)
+        if found is None:
+            return
+        reply, told = found
+        done = sum(each.state.final for each in record.subtasks)
+        text = f"{record.id} {record.state}"
+        if record.state is TaskState.RUNNING:
+            text += f" {done}/{len(record.subtasks)}"
+        if record.failure is not None:
+            text += f": {record.failure.message}"
+        if text != told:
+            severity = _ERROR if record.state is TaskState.FAILED else _NOTICE if record.state.final else _INFO
+            self._say(reply, text, severity)
+            self._follow[record.id] = (reply, text)
+        if record.state.final:
+            del self._follow[record.id]
+
+    def _reply(self, frame: Frame, reply: Callable[[Message], None], asked: Asked) -> None:
+        if asked.why:
+            self._say(reply, asked.why, _ERROR)
+        self._answer(frame, reply, asked.result or dialect.ACCEPTED, number=task_number(asked.task))
+
+    def _answer(self, frame: Frame, reply: Callable[[Message], None], result: int, *, number: int = 0) -> None:
+        fields: dict[str, Any] = {
+            "command": frame.message.command,
+            "result": result,
+            "progress": 255 if result == dialect.IN_PROGRESS else 0,
+            "result_param2": number,
+            "target_system": frame.system,
+            "target_component": frame.component,
+        }
+        reply(dialect.make("COMMAND_ACK", **fields))
+
+    def _say(self, reply: Callable[[Message], None], text: str, severity: int) -> None:
+        """Send a STATUSTEXT, in at most four parts; ASCII, since displays on radios know no other."""
+        data = text.encode("ascii", "replace")[: 4 * _TEXT]
+        number = 0 if len(data) <= _TEXT else 1 + secrets.randbelow(65_535)
+        for part in range(0, max(1, len(data)), _TEXT):
+            reply(
+                dialect.make(
+                    "STATUSTEXT", severity=severity, text=data[part : part + _TEXT], id=number, chunk_seq=part // _TEXT
+                )
+            )
+
+    def _count(self, what: str) -> None:
+        self._refused[what] = self._refused.get(what, 0) + 1

@@ -1,0 +1,248 @@
+"""Tasks asked for by MAVLink command: asked once, answered alike, refused with a reason."""
+
+import asyncio
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.errors import ConfigError, RefusedError, SwiftbotError
+from appliance.model import Failure, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState
+from appliance.robots.doors import Tasks
+from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
+from appliance.robots.mavlink.requests import RequestDesk, task_number
+from appliance.robots.qgc import actions
+from appliance.robots.settings import RobotsConfig, Template
+from tests.unit.robots.conftest import FakeStore
+
+pytestmark = pytest.mark.anyio
+
+TEMPLATES = (
+    Template(id=1, instruction="{robot} photograph the gate", label="Gate"),
+    Template(id=2, instruction="film the yard for {2} seconds at {5} {6}"),
+)
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, IN_PROGRESS = 0, 1, 2, 3, 5
+
+
+class Fleet:
+    """The fleet's tasks, and what a desk said to the sender."""
+
+    def __init__(self, store: FakeStore) -> None:
+        self.store = store
+        self.submitted: list[TaskRequest] = []
+        self.cancelled: list[str] = []
+        self.error: SwiftbotError | None = None
+        self.gate = asyncio.Event()
+        self.gate.set()
+        self.said: list[Message] = []
+        self.refused: dict[str, int] = {}
+        self.desk = self.new_desk()
+
+    def new_desk(self) -> RequestDesk:
+        """Return a desk on the same store, as after a restart."""
+        tasks = Tasks(submit=self.submit, cancel=self.cancel)
+        return RequestDesk(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused)
+
+    async def submit(self, request: TaskRequest) -> TaskRecord:
+        """Take a task, or raise."""
+        await self.gate.wait()
+        if self.error is not None:
+            raise self.error
+        self.submitted.append(request)
+        return TaskRecord(id=request.id, instruction=request.instruction)
+
+    async def cancel(self, task: str) -> TaskRecord:
+        """Cancel a task."""
+        self.cancelled.append(task)
+        return TaskRecord(id=task, instruction="", state=TaskState.CANCELLING)
+
+    def send(self, *, robot: str = "drone_1", name: str = "COMMAND_LONG", **fields: Any) -> None:
+        """Send a command."""
+        numbers = {f"param{number}": 0.0 for number in range(1, 8)}
+        if name == "COMMAND_INT":
+            numbers = {f"param{number}": 0.0 for number in range(1, 5)}
+            numbers |= {"frame": 0, "current": 0, "autocontinue": 0, "x": 0, "y": 0, "z": 0.0}
+        else:
+            numbers["confirmation"] = 0
+        common = {"target_system": 1, "target_component": 191, "command": 31010}
+        (frame,) = Codec(245, 191).read(Codec(255, 190).pack(make(name, **(common | numbers | fields))))
+        assert isinstance(frame, Frame)
+        self.desk.take(frame, robot=robot, reply=self.said.append)
+
+    @property
+    def acks(self) -> list[tuple[int, int]]:
+        """Result and number of each COMMAND_ACK so far."""
+        return [(each.result, each.result_param2) for each in self.said if each.get_type() == "COMMAND_ACK"]
+
+    @property
+    def texts(self) -> list[str]:
+        """STATUSTEXTs so far."""
+        return [str(each.text) for each in self.said if each.get_type() == "STATUSTEXT"]
+
+    async def answered(self, count: int) -> None:
+        """Wait for so many answers."""
+        async with asyncio.timeout(10):
+            while len(self.acks) < count:
+                await asyncio.sleep(0)
+        for _ in range(3):
+            await asyncio.sleep(0)
+
+
+@pytest.fixture
+def fleet(store: FakeStore) -> Fleet:
+    """Return a fleet."""
+    return Fleet(store)
+
+
+async def test_a_button_makes_a_task(fleet: Fleet) -> None:
+    """IN_PROGRESS, then ACCEPTED with the task's number when it is durable; its text has the vehicle's name."""
+    fleet.send(param1=1.0)
+    await fleet.answered(2)
+    (request,) = fleet.submitted
+    assert (request.instruction, request.submitter) == ("drone_1 photograph the gate", "drone_1")
+    assert fleet.acks == [(IN_PROGRESS, 0), (ACCEPTED, task_number(request.id))]
+
+
+async def test_arguments_are_filled_in(fleet: Fleet) -> None:
+    """Numbers are written plainly; a COMMAND_INT's place is in degrees."""
+    fleet.send(name="COMMAND_INT", robot="", param1=2.0, param2=30.0, x=473977420, y=-85455940)
+    await fleet.answered(2)
+    assert fleet.submitted[0].instruction == "film the yard for 30 seconds at 47.397742 -8.545594"
+
+
+async def test_a_repetition_is_answered_alike(fleet: Fleet) -> None:
+    """A command with a confirmation count is the same task, while it is handed in, after, and after a restart."""
+    fleet.gate.clear()
+    fleet.send(param1=1.0)
+    await fleet.answered(1)
+    fleet.send(param1=1.0, confirmation=1)
+    fleet.send(param1=2.0)
+    assert [result for result, _ in fleet.acks] == [IN_PROGRESS, IN_PROGRESS, TEMPORARILY_REJECTED]
+    fleet.gate.set()
+    await fleet.answered(4)
+    fleet.send(param1=1.0, confirmation=2)
+    await fleet.answered(5)
+    fleet.desk = fleet.new_desk()
+    await fleet.desk.load()
+    fleet.send(param1=1.0, confirmation=3)
+    await fleet.answered(6)
+    assert len(fleet.submitted) == 1
+    assert fleet.acks[3:] == [(ACCEPTED, task_number(fleet.submitted[0].id))] * 3
+    fleet.send(param1=1.0)
+    await fleet.answered(8)
+    assert len({each.id for each in fleet.submitted}) == 2
+
+
+async def test_a_crash_before_the_answer(fleet: Fleet) -> None:
+    """A gateway that was killed while handing in asks for the very same task when its sender repeats."""
+    fleet.gate.clear()
+    fleet.send(param1=1.0)
+    await fleet.answered(1)
+    await fleet.desk.close()
+    fleet.gate.set()
+    kept = [msgspec.json.decode(value)["task"] for value in fleet.store.values.values()]
+    fleet.desk = fleet.new_desk()
+    await fleet.desk.load()
+    fleet.send(param1=1.0, confirmation=1)
+    await fleet.answered(3)
+    assert [each.id for each in fleet.submitted] == kept
+
+
+@pytest.mark.parametrize(
+    ("fields", "robot", "told"),
+    [
+        ({"param1": 9.0}, "drone_1", "no template 9; known: 1, 2"),
+        ({"param1": float("nan")}, "drone_1", "no template nan"),
+        ({"param1": float("inf")}, "drone_1", "no template inf"),
+        ({"param1": 1.0}, "", "needs a vehicle"),
+        ({"param1": 2.0, "param2": float("nan")}, "", "needs a number as param2"),
+    ],
+)
+async def test_what_cannot_be(fleet: Fleet, fields: dict[str, float], robot: str, told: str) -> None:
+    """Unknown templates and numbers that are none are DENIED, with a text that says why; repeated, the same again."""
+    fleet.send(robot=robot, **fields)
+    await fleet.answered(2)
+    assert fleet.acks[-1][0] == DENIED
+    assert told in "".join(fleet.texts)
+    assert fleet.submitted == []
+    assert fleet.refused == {"mavlink_request_denied": 1}
+
+
+async def test_back_pressure_passes(fleet: Fleet) -> None:
+    """A fleet that is full rejects for now with the reason; a repetition is tried again and taken."""
+    fleet.error = RefusedError("too many tasks")
+    fleet.send(param1=1.0)
+    await fleet.answered(2)
+    assert (fleet.acks[-1][0], fleet.texts) == (TEMPORARILY_REJECTED, ["too many tasks"])
+    fleet.error = None
+    fleet.send(param1=1.0, confirmation=1)
+    await fleet.answered(4)
+    assert fleet.acks[-1][0] == ACCEPTED
+
+
+async def test_other_commands(fleet: Fleet) -> None:
+    """What is no request is UNSUPPORTED, and counted."""
+    fleet.send(command=400)
+    assert fleet.acks == [(UNSUPPORTED, 0)]
+    assert fleet.refused == {"command_unsupported": 1}
+
+
+async def test_cancelling(fleet: Fleet) -> None:
+    """MAV_CMD_USER_2 cancels the sender's last task; without one it is DENIED."""
+    fleet.send(command=31011)
+    await fleet.answered(1)
+    assert fleet.acks == [(DENIED, 0)]
+    fleet.send(param1=1.0)
+    await fleet.answered(3)
+    fleet.send(command=31011)
+    await fleet.answered(5)
+    assert fleet.cancelled == [fleet.submitted[0].id]
+    assert fleet.acks[-1] == (ACCEPTED, task_number(fleet.submitted[0].id))
+
+
+async def test_how_it_goes_on_is_told(fleet: Fleet) -> None:
+    """Each change is told once, long reasons in parts that belong together, and nothing of others' tasks."""
+    fleet.send(param1=1.0)
+    await fleet.answered(2)
+    task = fleet.submitted[0].id
+    parts = tuple(SubtaskRecord(subtask=Subtask(id=f"s{number}", skill="goto")) for number in (1, 2))
+    running = TaskRecord(id=task, instruction="", state=TaskState.RUNNING, subtasks=parts)
+    failure = Failure(code="robot", message="the gripper is jammed – nobody could have known that this would happen")
+    for record in (
+        running, running, msgspec.structs.replace(running, id="another"),
+        msgspec.structs.replace(running, state=TaskState.FAILED, failure=failure), running,
+    ):  # fmt: skip
+        fleet.desk.news(record)
+    first, *rest = [each for each in fleet.said if each.get_type() == "STATUSTEXT"]
+    assert first.text == f"{task} running 0/2"
+    assert "".join(each.text for each in rest).startswith(f"{task} failed: the gripper is jammed ? nobody")
+    assert [each.chunk_seq for each in rest] == [0, 1]
+    assert len({each.id for each in rest}) == 1
+    assert rest[0].id != 0
+    assert rest[0].severity == 3
+
+
+@pytest.mark.parametrize(
+    "templates",
+    [
+        (Template(id=0, instruction="x"),),
+        (Template(id=1, instruction=" "),),
+        (Template(id=1, instruction="go to {1}"),),
+        (Template(id=1, instruction="go {where}"),),
+        (Template(id=1, instruction="x"), Template(id=1, instruction="y")),
+    ],
+)
+def test_templates_that_cannot_be(templates: tuple[Template, ...]) -> None:
+    """Impossible numbers, empty texts, places that stand for nothing and double ids are ConfigErrors."""
+    with pytest.raises(ConfigError):
+        RobotsConfig(templates=templates).check()
+
+
+def test_buttons_for_a_ground_station() -> None:
+    """QGroundControl's file has a button for each template, with its command, component and number."""
+    made = msgspec.json.decode(actions(TEMPLATES, component=191))
+    assert (made["version"], made["fileType"]) == (1, "MavlinkActions")
+    assert [(each["label"], each["mavCmd"], each.get("param1")) for each in made["actions"]] == [
+        ("Gate", 31010, 1), ("film the yard for {2} seconds ", 31010, 2), ("Cancel task", 31011, None),
+    ]  # fmt: skip
+    assert {each["compId"] for each in made["actions"]} == {191}
