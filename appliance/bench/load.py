@@ -51,7 +51,7 @@ class Sampled(Struct, frozen=True, kw_only=True):
     cpu: float = 0.0
     """Busy part of all cores, 0 to 1."""
     daemons: dict[str, float] = {}
-    """Cores used by each process of the fleet, and by `sender` (the benchmark itself)."""
+    """Cores used by each process of the fleet, by `sender` (this benchmark) and by `others` (containers, Podman)."""
     queue: dict[str, int] = {}
     """The most runs seen waiting for a container, by gateway."""
     containers: dict[str, int] = {}
@@ -125,7 +125,7 @@ def _causes(outcomes: Sequence[Outcome], seen: Sampled) -> list[str]:
         most = ", ".join(f"{name} {cores:.2f} cores" for name, cores in first)
         found.append(f"CPU: all cores {seen.cpu:.0%} busy ({most})")
     else:
-        full = [name for name, cores in seen.daemons.items() if cores >= SATURATED]
+        full = [name for name, cores in seen.daemons.items() if cores >= SATURATED and name != "others"]
         found += [f"CPU: {name} fills its one core" for name in full]
     if waiting := sorted(((length, name) for name, length in seen.queue.items() if length), reverse=True):
         lengths = ", ".join(f"{length} at {name}" for length, name in waiting)

@@ -193,10 +193,14 @@ class Watch:
         """Sum up what was seen since it was made."""
         wall_s = max(1e-3, time.monotonic() - self._began)
         used = self._used()
+        busy = busy_s() - self._busy_s
+        cores = {name: (used[name] - before) / wall_s for name, before in self._used_s.items() if name in used}
+        # Containers, Podman, the kernel, and whatever else the machine does.
+        cores["others"] = max(0.0, busy / wall_s - sum(cores.values()))
         gateways = self._orders.client.plane.registry.gateways
         self.seen = Sampled(
-            cpu=min(1.0, (busy_s() - self._busy_s) / wall_s / (psutil.cpu_count() or 1)),
-            daemons={name: (used[name] - before) / wall_s for name, before in self._used_s.items() if name in used},
+            cpu=min(1.0, busy / wall_s / (psutil.cpu_count() or 1)),
+            daemons=cores,
             queue=self._queue,
             containers={name: status.containers for name, status in sorted(gateways.items())},
         )
@@ -234,15 +238,14 @@ def targets(ladders: Sequence[dict[str, Any]]) -> dict[str, Any]:
             found[f"p99_at_{PROMISED_RATE:g}_{spread}"] = {
                 "promised_ms": PROMISED_P99_MS, "reached_ms": reached, "kept": reached <= PROMISED_P99_MS,
             }  # fmt: skip
-    times: dict[str, float] = {}
     for each in ladders:
-        if (each["mode"], each["spread"]) == ("local", "uneven"):
-            for rate, cell in each["cells"].items():
-                below = p99("federated", "uneven", each["service_ms"], float(rate))
-                if (factor := ratio(cell["start"].get("p99"), below)) is not None:
-                    times[f"{each['service_ms']:g} ms at {rate}/s"] = factor
-    if times:
-        found["uneven_local_over_federated_p99"] = {
-            "promised": PROMISED_UNEVEN, "reached": times, "kept": max(times.values()) >= PROMISED_UNEVEN,
-        }  # fmt: skip
+        if (each["mode"], each["spread"]) == ("local", "uneven") and each["service_ms"] > 0:
+            # Where the baseline broke before, it is compared at its last rate.
+            rate = min(PROMISED_RATE, max(float(rate) for rate in each["cells"]))
+            above = p99("local", "uneven", each["service_ms"], rate)
+            below = p99("federated", "uneven", each["service_ms"], rate)
+            if (factor := ratio(above, below)) is not None:
+                found[f"uneven_local_over_federated_p99_at_{rate:g}_of_{each['service_ms']:g}_ms"] = {
+                    "promised": PROMISED_UNEVEN, "reached": factor, "kept": factor >= PROMISED_UNEVEN,
+                }  # fmt: skip
     return found

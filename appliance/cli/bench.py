@@ -6,6 +6,7 @@ from collections.abc import Coroutine
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import uvloop
 from cyclopts import App, Parameter
 
 from appliance import console
@@ -21,7 +22,10 @@ def add_to(app: App) -> None:
 
 
 def measure(work: Coroutine[Any, Any, T]) -> T:
-    """Run a measurement; SIGTERM ends it as Ctrl-C does, so that fleets, containers and folders go with it."""
+    """Run a measurement on the event loop that the daemons use.
+
+    SIGTERM ends it as Ctrl-C does, so that fleets, containers and folders go with it.
+    """
 
     async def ended_by_signal() -> T:
         task = asyncio.current_task()
@@ -30,7 +34,7 @@ def measure(work: Coroutine[Any, Any, T]) -> T:
         return await work
 
     try:
-        return asyncio.run(ended_by_signal())
+        return uvloop.run(ended_by_signal())
     except asyncio.CancelledError:
         raise KeyboardInterrupt from None
 

@@ -64,7 +64,7 @@ async def test_rates(built: None) -> None:
     assert set(ladder["cells"]) == {"4", "8"}
     for cell in ladder["cells"].values():
         assert cell["start"]["count"] == sum(cell["phases"].values()) + sum(cell["unserved"].values())
-        assert set(cell["cores_by_process"]) == {"gw-1", "gw-2", "gw-3", "gw-4", "recorder", "sender"}
+        assert set(cell["cores_by_process"]) == {"gw-1", "gw-2", "gw-3", "gw-4", "recorder", "sender", "others"}
     assert any("8/s" in each for each in told)
 
 
