@@ -18,8 +18,13 @@ from appliance.pool.container import Connection, Frame
 
 log = structlog.get_logger(__name__)
 
-PROGRESS_INTERVAL_S = 0.05
-"""A handler may tell its progress as often as it likes; more than 20 a second is passed on to nobody."""
+NEWS_INTERVAL_S = 0.05
+"""A handler may tell its progress, partial results and checkpoints as often as it likes; of more than 20 a second the
+newest is passed on."""
+FRAMES_PER_S = 2000.0
+"""Frames of one run that are read; a handler that sends more waits for its socket, and the event loop for nobody."""
+BURST = 4000.0
+"""Frames that may come at once."""
 MAX_LINES = 2000
 """Log lines of one run that are passed on."""
 MAX_CALLS = 8
@@ -90,7 +95,11 @@ class Conversation:
         self._refused = refused
         self._calls: set[asyncio.Task[None]] = set()
         self._lines = 0
-        self._told_progress = 0.0
+        self._news: dict[RunEventKind, RunEvent] = {}
+        self._told: dict[RunEventKind, float] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._allowance = BURST
+        self._allowed_at = time.monotonic()
         self.broken = False
         """Whether the runner broke its protocol, so that nothing it may still say can be trusted."""
 
@@ -116,14 +125,29 @@ class Conversation:
                 final = await self._take(frame)
                 if final is not None:
                     return final
+                await self._pace()
         except PayloadError as error:
             self._refused["runner frame"] += 1
             self.broken = True
-            return self.failed(error.code, error.message)
+            return self.failed(error.code, error.message, remedy="another container takes its place; see its handler")
         finally:
+            self._flush()
             for call in self._calls:
                 call.cancel()
-        return self.failed("pool", "the container died in mid-run")
+        return self.failed(
+            "pool", "the container died in mid-run", remedy="it is replaced; the gateway's log tells what became of it"
+        )
+
+    async def _pace(self) -> None:
+        """Let a run that floods its gateway wait."""
+        self._allowance -= 1.0
+        if self._allowance <= 0.0:
+            now = time.monotonic()
+            self._allowance += min(BURST, (now - self._allowed_at) * FRAMES_PER_S)
+            self._allowed_at = now
+            if self._allowance <= 0.0:
+                self._refused["flood"] += 1
+                await asyncio.sleep(NEWS_INTERVAL_S)
 
     async def gone(self) -> None:
         """Wait until the runner has swept up, which it tells by hanging up."""
@@ -141,10 +165,9 @@ class Conversation:
             case "log":
                 self._line(frame)
             case "partial":
-                self._on_event(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
+                self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
-                data = _table(frame.get("data"))
-                self._on_event(self.event(RunEventKind.CHECKPOINT, result=data))
+                self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data"))))
             case "call":
                 await self._call(frame)
             case "result":
@@ -157,12 +180,30 @@ class Conversation:
         return None
 
     def _progress(self, frame: Frame) -> None:
+        fraction, note = _number(frame.get("fraction")), str(frame.get("note", ""))
+        self._tell(self.event(RunEventKind.PROGRESS, progress=fraction, note=note))
+
+    def _tell(self, event: RunEvent) -> None:
+        """Pass news on, or hold it until its kind may be told again; newer news takes its place."""
         now = time.monotonic()
-        fraction = _number(frame.get("fraction"))
-        if now - self._told_progress >= PROGRESS_INTERVAL_S or fraction >= 1.0:
-            self._told_progress = now
-            note = str(frame.get("note", ""))
-            self._on_event(self.event(RunEventKind.PROGRESS, progress=fraction, note=note))
+        due = self._told.get(event.kind, 0.0) + NEWS_INTERVAL_S
+        if now >= due and event.kind not in self._news:
+            self._told[event.kind] = now
+            self._on_event(event)
+            return
+        self._news[event.kind] = event
+        if self._timer is None:
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, due - now), self._flush)
+
+    def _flush(self) -> None:
+        """Pass on all that is held."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        news, self._news = self._news, {}
+        for kind, event in news.items():
+            self._told[kind] = time.monotonic()
+            self._on_event(event)
 
     def _line(self, frame: Frame) -> None:
         self._lines += 1

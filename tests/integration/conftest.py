@@ -3,12 +3,11 @@
 import getpass
 import shutil
 import tempfile
-import textwrap
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
-from pool_bench import HANDLER, Bench
+from pool_bench import HANDLER, Bench, write_probe
 
 from appliance.errors import PrerequisiteError
 from appliance.pool import images
@@ -46,15 +45,7 @@ def probe() -> tuple[str, str]:
 @pytest.fixture
 def catalogue(folder: Path, probe: tuple[str, str]) -> Catalogue:
     """Return the real catalogue with one skill more, which does what it is told."""
-    skill = folder / "skills" / "probe"
-    skill.mkdir(parents=True)
-    source, manifest = probe
-    (skill / "handler.py").write_text(textwrap.dedent(source))
-    (skill / "skill.toml").write_text(
-        'id = "probe"\ndomain = "coordination"\nsummary = "A test."\nruns = "compute"\n'
-        'image = "base"\ncpu = 0.2\nmemory_mb = 64\n' + manifest
-    )
-    return load_catalogue([skill.parent])
+    return load_catalogue([write_probe(folder, *probe)])
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import asyncio
 import secrets
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,18 @@ def run(ctx):
 """
 
 
+def write_probe(folder: Path, handler: str, manifest: str = "") -> Path:
+    """Write the skill `probe`, with further lines of its manifest; returns the folder of skills it is in."""
+    skill = folder / "skills" / "probe"
+    skill.mkdir(parents=True)
+    (skill / "handler.py").write_text(textwrap.dedent(handler))
+    (skill / "skill.toml").write_text(
+        'id = "probe"\ndomain = "coordination"\nsummary = "A test."\nruns = "compute"\n'
+        'image = "base"\ncpu = 0.2\nmemory_mb = 64\n' + manifest
+    )
+    return skill.parent
+
+
 class Bench:
     """Pools of one fleet of the test's own."""
 
@@ -104,14 +117,17 @@ class Bench:
                 await asyncio.sleep(0.02)
 
     @staticmethod
-    def request(do: str, number: int = 1) -> RunRequest:
+    def request(do: str, number: int = 1, **more: Any) -> RunRequest:
         """Return an order."""
         need = Need(image="base", cpu=0.2, memory_mb=64)
-        return RunRequest(task="t", subtask=f"s{number}", attempt=1, skill="probe", need=need, params={"do": do})
+        params = {"do": do}
+        return RunRequest(task="t", subtask=f"s{number}", attempt=1, skill="probe", need=need, params=params, **more)
 
-    async def run(self, pool: Pool, do: str, number: int = 1, *, seen: list[RunEvent] | None = None) -> RunEvent:
+    async def run(
+        self, pool: Pool, do: str, number: int = 1, *, seen: list[RunEvent] | None = None, **more: Any
+    ) -> RunEvent:
         """Select and run; returns the last event."""
-        request = self.request(do, number)
+        request = self.request(do, number, **more)
         decision = await pool.select(request.need, allow_remote=False)
         return await pool.run(request, decision, (seen if seen is not None else []).append)
 

@@ -6,6 +6,7 @@ comes: a run then begins with one message.
 """
 
 import contextlib
+import errno
 import marshal
 import mmap
 import os
@@ -29,8 +30,8 @@ MAX_RESULT = 4 * 2**20
 """Longest result in bytes of JSON; larger things are artifacts."""
 MAX_OUTPUT = 256 * 1024
 """Bytes of a handler's own stdout and stderr that are kept as log lines."""
-MAX_LINES = 2000
-"""Lines of it that are kept; a gateway passes on no more."""
+MAX_LINES = 1900
+"""Lines of it that are kept: a gateway passes on 2,000, its last words among them."""
 MAX_LINE = 4096
 MAX_ORDER = 64 * 1024
 """Longest order in bytes that is handed to a child forked ahead: it fits into a socket's buffer, so nobody waits."""
@@ -38,6 +39,9 @@ MAX_ORDER = 64 * 1024
 # Bytes of the memory shared with the zygote.
 IN_TRANSIT, DONE, REASON = 0, 1, 2
 REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned"}
+SLOW = "raise timeout_s in its skill.toml, or find out what it waits for"
+LARGE = "put large things with ctx.put_artifact and return the reference"
+BROKEN = "its last lines are in the log: mend its handler"
 
 
 class Kit:
@@ -117,23 +121,35 @@ def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - on
             return _error("skill", f"{name} returned {type(result).__name__}, not a dict", remedy="return a dict")
         body = len(encode({"ev": "result", "result": result}))
     except Cancelled:
-        reason = REASONS.get(kit.shared[REASON], "orphaned")
-        return _error(reason, f"{name} was ended: {reason}", retryable=reason != "cancelled")
+        return _cancelled(kit, name)
     except CallError as error:
         return _error(error.code, error.message, remedy=error.remedy, retryable=error.retryable)
     except Fail as error:
         return _error("skill", error.message, remedy=error.remedy, retryable=error.retryable)
-    except (FrameError, TypeError) as error:
-        return _error("payload" if isinstance(error, FrameError) else "skill", explain(error), trace=_trace(error))
+    except FrameError as error:
+        return _error("payload", explain(error), remedy=LARGE, trace=_trace(error))
     except MemoryError as error:
         text = f"{name} ran out of its memory ({order.get('memory_mb')} MB and headroom)"
         return _error("memory", text, remedy="raise memory_mb in its skill.toml", retryable=True, trace=_trace(error))
+    except OSError as error:
+        remedy = BROKEN
+        if error.errno == errno.EFBIG:
+            remedy = f"no file may be longer than {skill.file_mb} MB: raise file_mb in its skill.toml"
+        elif error.errno == errno.ENOSPC:
+            remedy = "its scratch folder holds pool.tmp_mb; a volume what the disk does: write less, or make room"
+        retryable = error.errno != errno.EFBIG
+        return _error("skill", explain(error), remedy=remedy, retryable=retryable, trace=_trace(error))
     except BaseException as error:  # noqa: BLE001 - supervision boundary: whatever a handler raises is the run's outcome
-        return _error("skill", explain(error), retryable=isinstance(error, OSError), trace=_trace(error))
+        return _error("skill", explain(error), remedy=BROKEN, trace=_trace(error))
     if body > MAX_RESULT:
-        remedy = "put large things with ctx.put_artifact and return the reference"
-        return _error("payload", f"result of {body} bytes, {MAX_RESULT} allowed", remedy=remedy)
+        return _error("payload", f"result of {body} bytes, {MAX_RESULT} allowed", remedy=LARGE)
     return {"ev": "result", "result": result}
+
+
+def _cancelled(kit: Kit, what: str) -> Frame:
+    reason = REASONS.get(kit.shared[REASON], "orphaned")
+    remedy = SLOW if reason == "deadline" else ""
+    return _error(reason, f"{what} was ended: {reason}", remedy=remedy, retryable=reason != "cancelled")
 
 
 def _trace(error: BaseException) -> list[str]:
@@ -141,8 +157,8 @@ def _trace(error: BaseException) -> list[str]:
     return [line[:300] for line in lines[-8:]]
 
 
-def _settle(kit: Kit, keep: int) -> int:
-    """Become a process of its own, with nothing of the zygote's but what it needs; returns its address space, bytes."""
+def _settle(kit: Kit, keep: int) -> None:
+    """Become a process of its own, with nothing of the zygote's but what it needs."""
     os.setsid()
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -165,66 +181,95 @@ def _settle(kit: Kit, keep: int) -> int:
     if numpy is not None:
         numpy.random.seed()  # or every run would draw the zygote's numbers again
     limit_ahead(kit.processes)
-    return address_space()
+
+
+class _Child:
+    """A child that is ready: on its own, its output followed, without an order yet."""
+
+    def __init__(self, kit: Kit, keep: int) -> None:
+        self.kit = kit
+        self.link = Link(self._mark)
+        _settle(kit, keep)
+        self._output = _Output(kit.pipe[0], self.link)
+        self._base = address_space()
+
+    def _mark(self, moving: bool) -> None:
+        self.kit.shared[IN_TRANSIT] = 1 if moving else 0
+
+    def _asked_to_end(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self.link.cancel()
+
+    def warm_up(self) -> None:
+        """Touch what the first lines of a run touch.
+
+        Pages shared with the zygote are copied when they are first written to, if only to count references: that
+        takes several times as long as the lines themselves.
+        """
+        ours, theirs = socket.socketpair()
+        order: Frame = marshal.loads(marshal.dumps({"params": {"a": [1.0, "b"]}, "inputs": {}, "timeout_s": 1.0}))  # noqa: S302 - its own
+        for name, skill in self.kit.loaded.spec.skills.items():
+            link = Link(lambda _: None)
+            link.attach(ours)
+            if name in self.kit.loaded.handlers:
+                value = self.kit.loaded.values.get(name)
+                spec = self.kit.loaded.spec
+                Context(link, order, skill=skill, spec=spec, preloaded=value, scratch=self.kit.scratch)
+                link.send({"ev": "started", "at": time.monotonic_ns()})
+                break
+        ours.close()
+        theirs.close()
+
+    def carry_out(self, order: Frame, connection: socket.socket) -> NoReturn:
+        """Run the handler, tell the outcome, end the process; SIGTERM is blocked when this begins."""
+        kit, shared = self.kit, self.kit.shared
+        self.link.attach(connection)
+        signal.signal(signal.SIGTERM, self._asked_to_end)
+        frame: Frame
+        try:
+            limit_run(
+                base=self._base,
+                memory_mb=int(order.get("memory_mb", 128)),
+                file_mb=kit.loaded.spec.skills[str(order["skill"])].file_mb,
+                timeout_s=float(order.get("timeout_s", 120.0)),
+            )
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+            frame = _outcome(order, self.link, kit)
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            self._output.finish()
+        except Cancelled:
+            # Asked to end before the handler began, or between its end and here.
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            frame = _cancelled(kit, "a run that had not begun")
+        except OSError as error:
+            frame = _error("pool", f"the run could not be set up: {explain(error)}", retryable=True)
+        with contextlib.suppress(Cancelled):
+            self.link.send(frame)
+            shared[DONE] = 1
+        os._exit(0)
 
 
 def wait(kit: Kit, channel: socket.socket) -> NoReturn:
     """Get ready, wait for an order on `channel`, carry it out; ends when the other side of it is closed."""
-    base = _settle(kit, channel.fileno())
+    child = _Child(kit, channel.fileno())
+    child.warm_up()
     message, handles, _, _ = socket.recv_fds(channel, MAX_ORDER, 1)
     if not message or not handles:
         os._exit(0)
     channel.close()
-    _carry_out(kit, marshal.loads(message), socket.socket(fileno=handles[0]), base)  # noqa: S302 - of our own zygote
+    child.carry_out(marshal.loads(message), socket.socket(fileno=handles[0]))  # noqa: S302 - of our own zygote
 
 
 def run(kit: Kit, order: Frame, connection: socket.socket) -> NoReturn:
     """Get ready and carry out one order; SIGTERM is blocked when this begins."""
     try:
-        base = _settle(kit, connection.fileno())
-    except OSError as error:
-        frame = _error("pool", f"the run could not be set up: {explain(error)}", retryable=True)
-        with contextlib.suppress(Cancelled):
-            Link(connection, lambda _: None).send(frame)
-            kit.shared[DONE] = 1
-        os._exit(0)
-    _carry_out(kit, order, connection, base)
-
-
-def _carry_out(kit: Kit, order: Frame, connection: socket.socket, base: int) -> NoReturn:
-    shared = kit.shared
-
-    def mark(moving: bool) -> None:
-        shared[IN_TRANSIT] = 1 if moving else 0
-
-    link = Link(connection, mark)
-
-    def asked_to_end(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        link.cancel()
-
-    signal.signal(signal.SIGTERM, asked_to_end)
-    frame: Frame
-    try:
-        limit_run(
-            base=base,
-            memory_mb=int(order.get("memory_mb", 128)),
-            file_mb=kit.loaded.spec.skills[str(order["skill"])].file_mb,
-            timeout_s=float(order.get("timeout_s", 120.0)),
-        )
-        output = _Output(kit.pipe[0], link)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-        frame = _outcome(order, link, kit)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        output.finish()
-    except Cancelled:
-        # Asked to end before the handler began, or between its end and here.
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        reason = REASONS.get(shared[REASON], "orphaned")
-        frame = _error(reason, "ended before it began", retryable=reason != "cancelled")
+        child = _Child(kit, connection.fileno())
     except (OSError, RuntimeError) as error:  # RuntimeError: no further thread can be started
         frame = _error("pool", f"the run could not be set up: {explain(error)}", retryable=True)
-    with contextlib.suppress(Cancelled):
-        link.send(frame)
-        shared[DONE] = 1
-    os._exit(0)
+        link = Link(lambda _: None)
+        link.attach(connection)
+        with contextlib.suppress(Cancelled):
+            link.send(frame)
+            kit.shared[DONE] = 1
+        os._exit(0)
+    child.carry_out(order, connection)

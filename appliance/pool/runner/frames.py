@@ -7,6 +7,7 @@ It exists on its own because the zygote, the child and the tests speak it. Bytes
 import base64
 import binascii
 import json
+from collections.abc import Callable
 from typing import Any, cast
 
 MAX_FRAME = 16 * 2**20
@@ -45,11 +46,17 @@ def encode(value: dict[str, Any]) -> bytes:
     return len(body).to_bytes(4, "big") + body
 
 
-class Decoder:
-    """Collects bytes and gives whole objects."""
+def parse(body: bytes) -> Any:
+    """Return the value of a frame's JSON; ValueError when it is none."""
+    return json.loads(body, object_hook=_unpack)
 
-    def __init__(self) -> None:
+
+class Decoder:
+    """Collects bytes and gives whole objects; `parse` may be a quicker one that reads the same."""
+
+    def __init__(self, parse: Callable[[bytes], Any] = parse) -> None:
         self._buffer = bytearray()
+        self._parse = parse
 
     @property
     def pending(self) -> int:
@@ -76,7 +83,7 @@ class Decoder:
         body = bytes(self._buffer[4 : 4 + length])
         del self._buffer[: 4 + length]
         try:
-            value: Any = json.loads(body, object_hook=_unpack)
+            value: Any = self._parse(body)
         except (ValueError, RecursionError, binascii.Error) as error:
             raise FrameError(f"not JSON: {error}") from error
         if not isinstance(value, dict):

@@ -13,6 +13,7 @@ HEADROOM = 512 * 2**20
 """Address space on top of `memory_mb`: thread stacks and allocator arenas are reserved, hardly ever touched."""
 MAX_FILES = 256
 """Open files of a run."""
+CORES = os.cpu_count() or 1
 LOCKED = 2**20
 """Bytes that a run may lock into memory."""
 
@@ -53,4 +54,4 @@ def limit_run(*, base: int, memory_mb: int, file_mb: int, timeout_s: float) -> N
     """
     _cap(resource.RLIMIT_AS, base + memory_mb * 2**20 + HEADROOM)
     _cap(resource.RLIMIT_FSIZE, file_mb * 2**20)
-    _cap(resource.RLIMIT_CPU, math.ceil(timeout_s * (os.cpu_count() or 1)) + 5)
+    _cap(resource.RLIMIT_CPU, math.ceil(timeout_s * CORES) + 5)

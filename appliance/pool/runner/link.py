@@ -4,6 +4,7 @@ It exists apart from `ctx` because the runner itself speaks over it too: that a 
 how it ended.
 """
 
+import errno
 import select
 import socket
 import threading
@@ -46,8 +47,8 @@ class Cancelled(BaseException):
 class Link:
     """The run's connection to its gateway. A cancel never tears a frame: it is held back while one moves."""
 
-    def __init__(self, connection: socket.socket, mark: Callable[[bool], None]) -> None:
-        self._socket = connection
+    def __init__(self, mark: Callable[[bool], None]) -> None:
+        self._socket: socket.socket
         self._mark = mark
         self._decoder = Decoder()
         self._sending = threading.Lock()
@@ -55,6 +56,10 @@ class Link:
         self._held = 0
         self._cancelled = False
         self._count = 0
+
+    def attach(self, connection: socket.socket) -> None:
+        """Take the connection; until then nothing may be sent."""
+        self._socket = connection
 
     def cancel(self) -> None:
         """Raise Cancelled in the handler, at once or as soon as the frame in transit is whole; only once."""
@@ -88,6 +93,8 @@ class Link:
                 try:
                     self._socket.sendall(data)
                 except OSError as error:
+                    if error.errno == errno.EBADF:  # the handler closed it: nothing has gone out
+                        self._mark(False)
                     raise Cancelled from error
                 self._mark(False)
         finally:

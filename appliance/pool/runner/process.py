@@ -133,7 +133,7 @@ class Run:
         remedy = ""
         if reason == "deadline":
             text = f"did not end within {self.timeout_s:g} s"
-            remedy = "raise timeout_s in its skill.toml, or find out what it waits for"
+            remedy = child.SLOW
         elif reason:
             text = f"was ended: {reason}"
         elif code < 0:
