@@ -31,7 +31,7 @@ from appliance.pool.settings import PoolConfig
 Mode = Literal["cold", "local", "federated"]
 MODES: tuple[Mode, ...] = ("cold", "local", "federated")
 SPREADS: tuple[Spread, ...] = ("even", "uneven")
-RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
+RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 GATEWAYS = ("gw-1", "gw-2", "gw-3", "gw-4")
 PER_GATEWAY = 4
 """Containers that a gateway may hold: 4 busy for 150 ms serve 26 runs/s, so uneven arrivals overload one gateway

@@ -61,7 +61,7 @@ def rate(
     *,
     mode: tuple[Literal["cold", "local", "federated"], ...] = ("cold", "local", "federated"),
     spread: tuple[Literal["even", "uneven"], ...] = ("even", "uneven"),
-    rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0),
+    rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (1, 2, 5, 10, 20, 40, 80, 160, 320),
     service_ms: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (0.0, 150.0),
     seconds: float = 6.0,
     limit_ms: float = 1000.0,
