@@ -45,7 +45,7 @@ from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
-from appliance.tasks.remote import RemoteContainers
+from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
 
 log = structlog.get_logger(__name__)
@@ -109,9 +109,7 @@ class Gateway:
             self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
         )
         calls = Calls(self.plane, artifacts, on_wait=self._on_wait)
-        remote = RemoteContainers(
-            self.plane, successors=config.plane.find_successors, link_mb_per_s=config.pool.link_mb_per_s
-        )
+        remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=UnmeasuredLinks())
 
         async def on_call(call: Call) -> dict[str, object]:
             return await calls(call)

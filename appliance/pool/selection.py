@@ -58,10 +58,12 @@ class Facts(Struct, frozen=True, kw_only=True):
 
     inputs: Mapping[str, int] = field(default_factory=dict[str, int])
     """Gateway -> bytes of the subtask's input files that are there."""
-    volumes: Mapping[str, VolumeInfo] = field(default_factory=dict[str, VolumeInfo])
-    """Where the newest state of each volume asked for is; a volume without state anywhere is left out."""
-    transfer_ms: Callable[[int, str], float] = _at_once
-    """Milliseconds that so many bytes take between here and a gateway."""
+    volumes: Mapping[str, tuple[VolumeInfo, ...]] = field(default_factory=dict[str, tuple[VolumeInfo, ...]])
+    """Who holds the newest state of each volume asked for; a volume without state anywhere is left out."""
+    files_ms: Callable[[int, str], float] = _at_once
+    """Milliseconds that so many bytes of files take between here and a gateway: size / bandwidth."""
+    state_ms: Callable[[int, str], float] = _at_once
+    """The same of state: serialise + size / bandwidth + deserialise."""
     avoid: Mapping[str, str] = field(default_factory=dict[str, str])
     """Gateways whose containers are not to be used, with the reason."""
 
@@ -118,36 +120,33 @@ class Prices:
 
     def __init__(self, need: Need, facts: Facts, config: PoolConfig, *, here: str, cold_ms: float) -> None:
         self._facts = facts
-        self._ms_per_byte = config.state_ms_per_mb / MB
-        self._here = here
-        known: Mapping[str, VolumeInfo] = facts.volumes if config.mode == "federated" else {}
-        self._state = [known[name] for name in sorted(set(need.volumes)) if name in known]
-        self.state_bytes = self._missing(here)
-        inputs_ms = sum(self._move(size, at) for at, size in facts.inputs.items() if at != here)
-        state_ms = sum(
-            self._move(each.size_bytes, each.gateway) + each.size_bytes * self._ms_per_byte
-            for each in self._state
-            if each.gateway != here
-        )
-        self.lacks_state = any(each.gateway != here for each in self._state)
-        """Whether the newest state of a volume asked for is elsewhere."""
+        known: Mapping[str, tuple[VolumeInfo, ...]] = facts.volumes if config.mode == "federated" else {}
+        self._state = [known[name] for name in sorted(set(need.volumes)) if known.get(name)]
+        missing = [each for each in self._state if not _is_at(each, here)]
+        self.lacks_state = bool(missing)
+        """Whether the newest state of a volume asked for is elsewhere only."""
+        self.state_bytes = sum(each[0].size_bytes for each in missing)
+        inputs_ms = sum(facts.files_ms(size, at) for at, size in facts.inputs.items() if at != here and size > 0)
+        state_ms = sum(min(facts.state_ms(holder.size_bytes, holder.gateway) for holder in each) for each in missing)
         self.warm_ms: float = inputs_ms + state_ms
         """Using a ready container here."""
         self.cold_ms: float = cold_ms + self.warm_ms
         """Starting one here."""
 
-    def _move(self, size: int, gateway: str) -> float:
-        return self._facts.transfer_ms(size, gateway) if size > 0 else 0.0
-
-    def _missing(self, gateway: str) -> int:
-        return sum(each.size_bytes for each in self._state if each.gateway != gateway)
-
     def there(self, candidate: Candidate) -> float:
         """Running in a container elsewhere: round trip, and what is not there yet."""
         gateway = candidate.container.gateway
+        cost_ms = candidate.round_trip_ms
         inputs = sum(size for at, size in self._facts.inputs.items() if at != gateway)
-        state = self._missing(gateway)
-        return candidate.round_trip_ms + self._move(inputs + state, gateway) + state * self._ms_per_byte
+        if inputs:
+            cost_ms += self._facts.files_ms(inputs, gateway)
+        # Our link to it stands for the one that state would really take: those between others are not measured here.
+        missing = (each[0].size_bytes for each in self._state if not _is_at(each, gateway))
+        return cost_ms + sum(self._facts.state_ms(size, gateway) for size in missing)
+
+
+def _is_at(holders: Sequence[VolumeInfo], gateway: str) -> bool:
+    return any(each.gateway == gateway for each in holders)
 
 
 class _Weighed(Struct, frozen=True):

@@ -84,10 +84,6 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     weights: Weights = field(default_factory=Weights)
     cold_ms: Positive = 500.0
     """What a cold start is thought to cost before one was measured here."""
-    link_mb_per_s: Positive = 50.0
-    """Megabytes a second between two gateways before it was measured: half of what a gigabit link gives."""
-    state_ms_per_mb: Annotated[float, Meta(ge=0)] = 5.0
-    """Packing a state volume up and unpacking it, milliseconds a megabyte (measured: 209 + 109 ms for 64 MiB)."""
     remote_timeout_s: Positive = 0.3
     """How long other gateways are asked for containers; beyond it a cold start would be quicker."""
 

@@ -9,13 +9,15 @@ out to be nothing, several times in a row, is left out for a while: it is out of
 import asyncio
 import time
 from collections.abc import Callable
+from typing import Protocol
 
 from msgspec import Struct
 
 from appliance.errors import SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need, VolumeInfo
 from appliance.plane.node import Plane
-from appliance.pool.selection import MB, Candidate, Facts
+from appliance.pool.selection import Candidate, Facts
+from appliance.pool.transfer.flow import Link
 from appliance.tasks.api import ContainerList
 
 ASK_TIMEOUT_S = 0.15
@@ -24,6 +26,30 @@ UNKNOWN_ROUND_TRIP_MS = 5.0
 EMPTY_OFFERS = 3
 """Offers in a row that were nothing, after which a gateway is left out; one or two are lost races."""
 LEFT_OUT_S = 10.0
+
+
+class Links(Protocol):
+    """What moving bytes costs: `pool.transfer.Transfers`."""
+
+    def bandwidth_mbps(self, gateway: str) -> float:
+        """Megabits per second with a gateway."""
+        ...
+
+    def cost_ms(self, size_bytes: int, gateway: str) -> float:
+        """Serialise + size / bandwidth + deserialise, milliseconds."""
+        ...
+
+
+class UnmeasuredLinks:
+    """Careful guesses, the same for every gateway, where nothing is moved that could be measured."""
+
+    def bandwidth_mbps(self, gateway: str) -> float:  # noqa: ARG002 - all are guessed alike
+        """Megabits per second."""
+        return Link().bandwidth * 8 / 1e6
+
+    def cost_ms(self, size_bytes: int, gateway: str) -> float:  # noqa: ARG002
+        """Serialise + size / bandwidth + deserialise, milliseconds."""
+        return Link().cost_ms(size_bytes)
 
 
 class _Trust(Struct):
@@ -39,13 +65,13 @@ class RemoteContainers:
     Args:
         plane: the fleet.
         successors: how many neighbours on the ring are asked.
-        link_mb_per_s: megabytes a second to a gateway, where nothing better is known.
+        links: what is measured of moving bytes to and from other gateways.
     """
 
-    def __init__(self, plane: Plane, *, successors: int, link_mb_per_s: float) -> None:
+    def __init__(self, plane: Plane, *, successors: int, links: Links) -> None:
         self._plane = plane
         self._successors = successors
-        self._ms_per_byte = 1e3 / (link_mb_per_s * MB)
+        self._links = links
         self._round_trip_ms: dict[str, float] = {}
         self._trust: dict[str, _Trust] = {}
         plane.on_member_lost.append(self._forget)
@@ -108,10 +134,11 @@ class RemoteContainers:
 
     def facts(self, need: Need) -> Facts:
         """Where the newest state of the volumes asked for is, and what moving bytes costs."""
-        newest = {name: found for name in need.volumes if (found := self._newest(name)) is not None}
-        return Facts(volumes=newest, transfer_ms=self._transfer_ms)
+        held = {name: holders for name in need.volumes if (holders := self._holders(name))}
+        return Facts(volumes=held, files_ms=self._files_ms, state_ms=self._links.cost_ms)
 
-    def _newest(self, volume: str) -> VolumeInfo | None:
+    def _holders(self, volume: str) -> tuple[VolumeInfo, ...]:
+        """Who holds the newest state of a volume, of the gateways that are there."""
         members = self._plane.members()
         known = [
             each
@@ -119,12 +146,12 @@ class RemoteContainers:
             for each in status.volumes
             if each.name == volume and each.gateway == gateway and gateway in members
         ]
-        return max(
-            known, key=lambda each: (each.generation, each.gateway == self._plane.gateway, each.gateway), default=None
-        )
+        newest = max((each.generation for each in known), default=0)
+        return tuple(each for each in known if each.generation == newest)
 
-    def _transfer_ms(self, size: int, gateway: str) -> float:
-        return size * self._ms_per_byte + self._round_trip_ms.get(gateway, UNKNOWN_ROUND_TRIP_MS)
+    def _files_ms(self, size: int, gateway: str) -> float:
+        """Bytes at so many megabits per second: 1 Mbit/s is 1000 bits a millisecond."""
+        return size * 8 / (1e3 * self._links.bandwidth_mbps(gateway))
 
     # --- how offers turn out --------------------------------------------------------------------------------------
 

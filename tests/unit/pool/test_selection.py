@@ -55,22 +55,27 @@ def some_facts(draw: st.DrawFn) -> Facts:
     volumes = draw(
         st.dictionaries(
             st.sampled_from(VOLUMES),
-            st.tuples(st.sampled_from(("g1", "g2", "g3")), st.integers(0, 10**9)),
+            st.tuples(st.lists(st.sampled_from(("g1", "g2", "g3")), min_size=1, unique=True), st.integers(0, 10**9)),
         )
     )
     return Facts(
         inputs=draw(st.dictionaries(st.sampled_from(("g1", "g2", "g3")), st.integers(0, 10**8))),
         volumes={
-            name: VolumeInfo(name=name, gateway=gateway, generation=1, size_bytes=size)
-            for name, (gateway, size) in volumes.items()
+            name: tuple(VolumeInfo(name=name, gateway=each, generation=1, size_bytes=size) for each in gateways)
+            for name, (gateways, size) in volumes.items()
         },
-        transfer_ms=lambda size, _: size / 1e6 * ms_per_mb,
+        files_ms=lambda size, _: size / 1e6 * ms_per_mb,
+        state_ms=lambda size, _: size / 1e6 * (ms_per_mb + 5),
         avoid=draw(st.dictionaries(st.just("g3"), st.just("it lies"), max_size=1)),
     )
 
 
 MAPS = VolumeInfo(name="maps", gateway="g2", generation=3, size_bytes=40_000_000)
-SLOW = Facts(volumes={"maps": MAPS}, transfer_ms=lambda size, _: size / 50_000)
+SLOW = Facts(
+    volumes={"maps": (MAPS,)},
+    files_ms=lambda size, _: size / 50_000,
+    state_ms=lambda size, _: size / 50_000 + size / 200_000,
+)
 """40 MB of state on g2, 50 MB/s away: 800 ms, and 200 ms to pack and unpack."""
 WITH_MAPS = Need(image="base", volumes=("maps",))
 
@@ -154,7 +159,8 @@ def test_state_that_exists_is_never_left_behind(
 ) -> None:
     """Where the newest state of a volume is elsewhere, the subtask goes there or the state comes."""
     decision = select(need, local, remote, cold_ms, PoolConfig(), gateway="g1", facts=facts)
-    elsewhere = any(name in facts.volumes and facts.volumes[name].gateway != "g1" for name in need.volumes)
+    held = [[each.gateway for each in facts.volumes[name]] for name in need.volumes if name in facts.volumes]
+    elsewhere = any("g1" not in holders for holders in held)
     assert (decision.way in (Way.BRING_HERE, Way.RUN_THERE)) or not elsewhere
     assert decision.way is not Way.BRING_HERE or elsewhere
     assert (decision.gateway == "g1") == (decision.way is not Way.RUN_THERE)
@@ -197,9 +203,10 @@ def test_the_subtask_goes_to_its_state_when_that_is_cheaper() -> None:
 def test_the_state_comes_here_when_that_is_cheaper() -> None:
     """A little state on g2 and large inputs here: a ready container here gets the state, at no cost of a start."""
     facts = Facts(
-        volumes={"maps": VolumeInfo(name="maps", gateway="g2", generation=1, size_bytes=1_000_000)},
+        volumes={"maps": (VolumeInfo(name="maps", gateway="g2", generation=1, size_bytes=1_000_000),)},
         inputs={"g1": 10_000_000},
-        transfer_ms=SLOW.transfer_ms,
+        files_ms=SLOW.files_ms,
+        state_ms=SLOW.state_ms,
     )
     offers = [there("far", volumes=("maps",))]
     decision = select(WITH_MAPS, [ready("near")], offers, 500, PoolConfig(), gateway="g1", facts=facts)
@@ -217,8 +224,8 @@ def test_without_a_container_anywhere_the_state_comes_to_a_new_one() -> None:
 
 def test_state_that_is_here_needs_nobody_else() -> None:
     """Phase 1 serves when the newest state is on this gateway, or nowhere."""
-    here = Facts(volumes={"maps": VolumeInfo(name="maps", gateway="g1", generation=9, size_bytes=10**9)})
-    for facts in (here, Facts()):
+    mine = VolumeInfo(name="maps", gateway="g1", generation=3, size_bytes=40_000_000)
+    for facts in (Facts(volumes={"maps": (mine,)}), Facts(volumes={"maps": (MAPS, mine)}), Facts()):
         decision = select(
             WITH_MAPS, [ready("near", volumes=("maps",))], [there("far")], 500, PoolConfig(), gateway="g1", facts=facts
         )
@@ -227,13 +234,13 @@ def test_state_that_is_here_needs_nobody_else() -> None:
 
 def test_input_bytes_keep_a_subtask_near_them() -> None:
     """100 MB of input here cost 2 s to g2: more than half a cold start, and the record says so."""
-    facts = Facts(inputs={"g1": 100_000_000}, transfer_ms=SLOW.transfer_ms)
+    facts = Facts(inputs={"g1": 100_000_000}, files_ms=SLOW.files_ms)
     decision = select(Need(image="base"), [], [there("far")], 500, PoolConfig(), gateway="g1", facts=facts)
     assert decision.phase is Phase.COLD
     assert decision.choice is not None
     far = next(each for each in decision.choice.considered if each.gateway == "g2")
     assert far.verdict == "costs 2002 ms, more than 0.5 of a cold start (500 ms)"
-    there_too = Facts(inputs={"g2": 100_000_000}, transfer_ms=SLOW.transfer_ms)
+    there_too = Facts(inputs={"g2": 100_000_000}, files_ms=SLOW.files_ms)
     decision = select(Need(image="base"), [], [there("far")], 500, PoolConfig(), gateway="g1", facts=there_too)
     assert decision.gateway == "g2"
 

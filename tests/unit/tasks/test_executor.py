@@ -25,7 +25,7 @@ from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk
 from appliance.tasks.checkpoints import read_checkpoint
 from appliance.tasks.executor import Executor
-from appliance.tasks.remote import RemoteContainers
+from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
 
 pytestmark = pytest.mark.anyio
 
@@ -37,7 +37,7 @@ AWAY = Decision(phase=Phase.REMOTE_WARM, gateway="gw-2", container="c2")
 @pytest.fixture
 async def executor(plane: Any, pool: Any, tasks_config: Any) -> Executor:
     """Return an executor that hears records."""
-    made = Executor(plane, pool, RemoteContainers(plane, successors=3, link_mb_per_s=50), tasks_config)
+    made = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
     await made.start()
     return made
 
@@ -198,7 +198,7 @@ async def test_a_restart_tells_of_lost_runs_and_skips_what_it_cannot_read(
     """A run in progress at the end has failed, retryable; a damaged row does not keep the gateway from starting."""
     begun = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.STARTED)
     plane.store.values = {"run/t-1/s1/1": encode(begun), "run/t-1/s2/1": b"\xff"}
-    executor = Executor(plane, pool, RemoteContainers(plane, successors=3, link_mb_per_s=50), tasks_config)
+    executor = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
     await executor.start()
     status = await executor.status(ASK)
     assert not status.running
