@@ -6,6 +6,7 @@ a container, and nothing here is awaited but one's turn.
 """
 
 import asyncio
+import math
 import secrets
 import time
 from collections import Counter, deque
@@ -21,6 +22,9 @@ FOR_A_RUN = "cold"
 """Reservation of a container that is started for one waiting run."""
 IN_TURN = "queue"
 """Reservation of a container that is handed to somebody in the queue."""
+
+FOR_STATE = "state"
+"""Reservation of a container whose run waits for the newest state of its volumes."""
 
 
 class _Waiter:
@@ -156,6 +160,11 @@ class Books:
         container.lease_until = time.monotonic() + self._config.lease_s
         container.become(ContainerState.RESERVED)
         self.changed()
+
+    def keep(self, container: PooledContainer) -> None:
+        """Hold a container until its run begins or gives it back: state is on its way."""
+        self.hold(container, FOR_A_RUN if container.reservation == FOR_A_RUN else FOR_STATE)
+        container.lease_until = math.inf
 
     def give_back(self, container: PooledContainer) -> None:
         """Let go of a container that was held or started for a run which does not want it any more."""

@@ -98,9 +98,18 @@ class Connection:
 class PooledContainer:
     """A container of the pool. The pool alone changes its `info`; reservation and times are the pool's notes."""
 
-    def __init__(self, info: ContainerInfo, folder: Path, *, on_death: Callable[["PooledContainer"], None]) -> None:
+    def __init__(
+        self,
+        info: ContainerInfo,
+        folder: Path,
+        *,
+        mounts: tuple[str, ...] = (),
+        on_death: Callable[["PooledContainer"], None],
+    ) -> None:
         self.info = info
         self.folder = folder
+        self.mounts = mounts
+        """State volumes that are mounted in it; `info.volumes` are those whose newest state is here."""
         self.engine_id = ""
         self.reservation = ""
         self.lease_until = 0.0

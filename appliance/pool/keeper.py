@@ -2,8 +2,8 @@
 
 It exists apart from the door (`pool.py`) because runs come and go by the second while containers have a life of
 their own. It decides nothing itself (`policies`) and touches no container itself (`starter`, `container`): it shows
-the planner what there is, carries out what that answers, and notes why (`decisions`). Who has which container is in
-the books (`books`); Podman is behind the link (`link`).
+the planner what there is, carries out what that answers, and notes why (`decisions`). Who has which container is in the
+`books`, starts in progress are in `starts`, Podman is behind the `link`.
 """
 
 import asyncio
@@ -23,10 +23,11 @@ from appliance.pool.container import PooledContainer
 from appliance.pool.decisions import Decisions
 from appliance.pool.engine import LABEL_ID, Engine, EngineFacts
 from appliance.pool.link import EngineLink
-from appliance.pool.policies import ColdCosts, Idle, Planner, Quarantine, Retire, View
+from appliance.pool.policies import Idle, Planner, Retire, View
 from appliance.pool.pressure import MemoryWatch, Reading
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
+from appliance.pool.starts import Starts
 
 log = structlog.get_logger(__name__)
 
@@ -66,7 +67,6 @@ class Keeper:
         refused: Counter[str],
         read_memory: Callable[[], Reading] | None = None,
     ) -> None:
-        self.costs = ColdCosts(config.cold_ms)
         self.decisions = Decisions()
         self.books = Books(config, begin=self._begin, on_change=on_change, refused=refused)
         self.link = EngineLink(make_engine, reconnect_s=config.reconnect_s, on_connected=self._on_connected)
@@ -76,8 +76,10 @@ class Keeper:
         self._refused = refused
         self._wake = asyncio.Event()
         self._starter = make_starter(lambda container: self.retire(container, "it died"))
-        self._planner = Planner(config, self.costs, lambda image: self._starter.size(image).memory_mb)
-        self._quarantine = Quarantine(after=config.bad_starts, for_s=config.quarantine_s)
+        self.starts = Starts(
+            config, starter=self._starter, link=self.link, decisions=self.decisions, on_end=self._on_started
+        )
+        self._planner = Planner(config, self.starts.costs, lambda image: self._starter.size(image).memory_mb)
         self._memory = MemoryWatch(
             config.pressure,
             memory_mb=config.memory_mb,
@@ -85,7 +87,6 @@ class Keeper:
             on_change=self._wake.set,
             read=read_memory,
         )
-        self._starts: dict[str, asyncio.Task[SwiftbotError | None]] = {}
         self._background: set[asyncio.Task[None]] = set()
         self._next_sweep = 0.0
         self.draining = False
@@ -99,7 +100,7 @@ class Keeper:
     @property
     def problem(self) -> str:
         """Why containers, or those of some image, cannot be started now; empty when they can."""
-        return self.link.problem or "; ".join(self._quarantine.reasons(time.monotonic()))
+        return self.link.problem or "; ".join(self.starts.problems(self._images).values())
 
     @property
     def squeeze(self) -> str:
@@ -126,13 +127,13 @@ class Keeper:
     def _check_image(self, image: str) -> None:
         if self.link.problem:
             raise PoolError(self.link.problem, remedy="swiftbot doctor tells more")
-        if reason := self._quarantine.reason(image, time.monotonic()):
+        if reason := self.starts.why_not(image):
             self._refused["quarantined image"] += 1
-            raise RefusedError(reason, remedy="swiftbot images build, then swiftbot doctor")
+            raise RefusedError(reason, remedy="swiftbot images build, then swiftbot pool release")
 
     def why_no_start(self, image: str) -> str:
         """Return why one more container of an image cannot be started ahead now; empty when it can."""
-        if reason := self.link.problem or self._quarantine.reason(image, time.monotonic()):
+        if reason := self.link.problem or self.starts.why_not(image):
             return reason
         size_mb = self._starter.size(image).memory_mb
         victims = self._room(size_mb, for_run=False)
@@ -166,14 +167,14 @@ class Keeper:
         await self.books.until(
             lambda: (
                 self.books.count(image, ContainerState.READY) >= count
-                or (not self._starts and bool(self.why_no_start(image)))
+                or (not self.starts and bool(self.why_no_start(image)))
             )
         )
 
     def release_quarantine(self, image: str) -> str:
         """Start containers of an image again; returns why they were not, empty when they were."""
-        reason = self._quarantine.reason(image, time.monotonic())
-        self._quarantine.succeeded(image)
+        reason = self.starts.why_not(image)
+        self.starts.forgive(image)
         self._wake.set()
         return reason
 
@@ -192,6 +193,7 @@ class Keeper:
         for task in self._standing:
             task.cancel()
         self.link.cancel()
+        self.starts.cancel()
         # Starts are let come to their end: one cut off between two steps would leave a container nobody knows.
         until = time.monotonic() + patience_s
         while tasks := self._unfinished():
@@ -216,7 +218,7 @@ class Keeper:
 
     def _unfinished(self) -> list[asyncio.Task[Any]]:
         standing = [task for task in self._standing if not task.done()]
-        return [*standing, *self.link.unfinished, *self._starts.values(), *self._background]
+        return [*standing, *self.link.unfinished, *self.starts.unfinished, *self._background]
 
     def spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
         """Run something in the background that `stop` waits for."""
@@ -231,7 +233,6 @@ class Keeper:
 
     def _view(self) -> View:
         """Return what there is, as the planner sees it."""
-        now = time.monotonic()
         idle: list[Idle] = []
         busy: Counter[str] = Counter()
         starting: Counter[str] = Counter()
@@ -245,7 +246,7 @@ class Keeper:
                             image=info.image,
                             memory_mb=info.memory_mb,
                             runs=info.runs,
-                            cold_ms=info.cold_ms or self.costs.of(info.image),
+                            cold_ms=info.cold_ms or self.starts.costs.of(info.image),
                             since=container.idle_since,
                         )
                     )
@@ -261,7 +262,7 @@ class Keeper:
             containers=len(self.books),
             budget_mb=self._memory.squeeze.budget_mb,
             capacity=self._config.capacity,
-            blocked=frozenset(image for image in self._images if self._quarantine.reason(image, now)),
+            blocked=frozenset(self.starts.problems(self._images)),
         )
 
     def _room(self, memory_mb: int, *, for_run: bool) -> tuple[Retire, ...] | None:
@@ -294,7 +295,7 @@ class Keeper:
             container = await self.books.wait(need)
         if container.info.state is ContainerState.STARTING:
             try:
-                error = await asyncio.shield(self._starts[container.id])
+                error = await self.starts.wait(container)
             except asyncio.CancelledError:
                 self.books.give_back(container)
                 raise
@@ -315,48 +316,19 @@ class Keeper:
         return container
 
     def _start(self, image: str, need: Need | None, why: str) -> PooledContainer:
-        container = self._starter.new(image, need)
-        self.decisions.note("start", image=image, container=container.id, why=why)
-        self._starts[container.id] = asyncio.create_task(self._carry_start(container), name=f"start {container.id}")
+        container = self.starts.begin(image, need, why)
         self.books.add(container)
         return container
 
-    async def _carry_start(self, container: PooledContainer) -> SwiftbotError | None:
-        """Start a container; returns why it did not, for whoever waits for it."""
-        image = container.info.image
-        error: SwiftbotError | None = None
-        try:
-            await self._starter.start(container, *self.link.there())
-        except SwiftbotError as caught:
-            error = caught
-        finally:
-            del self._starts[container.id]
-            if container.info.cold_ms is None:
-                self.books.drop(container)
-        if error is None and self.books.get(container.id) is None:
-            error = PoolError(f"container {container.id} died as soon as it was there")
+    def _on_started(self, container: PooledContainer, error: SwiftbotError | None) -> None:
         if error is not None:
-            self._start_failed(container, error)
-            return error
-        self._quarantine.succeeded(image)
-        cold_ms = container.info.cold_ms or 0.0
-        self.costs.add(image, cold_ms)
-        log.info("container ready", image=image, container=container.id, took_ms=round(cold_ms))
-        container.next_probe = time.monotonic() + self._config.probe_s
-        if container.reservation == FOR_A_RUN:
+            self.books.drop(container)
+            self.books.serve()
+        elif container.reservation == FOR_A_RUN:
             self.books.hold(container, FOR_A_RUN)  # with a lease, should whoever waits go away at this very moment
         else:
             self.books.ready(container)
-        return None
-
-    def _start_failed(self, container: PooledContainer, error: SwiftbotError) -> None:
-        image = container.info.image
-        self.decisions.note("fail", image=image, container=container.id, why=str(error))
-        if isinstance(error, UnreachableError):
-            self.link.lost(error)
-        else:
-            self._quarantine.failed(image, str(error), time.monotonic())
-        self.books.serve()
+        container.next_probe = time.monotonic() + self._config.probe_s
         self._wake.set()
 
     # --- after a run, and ending ------------------------------------------------------------------------------
@@ -421,7 +393,10 @@ class Keeper:
     def _tend(self, now: float) -> None:
         self.link.tend(now)
         self.books.expire(now)
+        self.starts.tend(now, self._wake.set)
         for container in self.books:
+            if container.mounts and self._starter.look_at_state(container):
+                self.books.changed()
             if container.info.state is not ContainerState.STARTING and now >= container.next_probe:
                 container.next_probe = math.inf  # one at a time
                 self.spawn(self._probe(container), f"probe {container.id}")

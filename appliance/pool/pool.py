@@ -31,6 +31,7 @@ from appliance.pool.running import Runs
 from appliance.pool.selection import Candidate, Decision, Facts, select
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
+from appliance.pool.state import ALONE, State
 from appliance.pool.verbs import Verbs, unknown_image
 from appliance.skills.catalogue import Catalogue
 
@@ -53,6 +54,7 @@ class Pool:
         facts: what selection must know of the fleet for a need: where state is, what moving bytes costs.
         on_call: carries out what a handler asks of the appliance.
         on_change: told the facts of all containers whenever one of them changes.
+        state: where state volumes and images of other gateways come from.
         make_engine: Podman, unless a test says otherwise.
         read_memory: what the kernel says of memory, unless a test says otherwise.
 
@@ -73,6 +75,7 @@ class Pool:
         facts: Callable[[Need], Facts] = lambda _: Facts(),
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
+        state: State = ALONE,
         make_engine: Callable[[], Engine] | None = None,
         read_memory: Callable[[], Reading] | None = None,
     ) -> None:
@@ -96,6 +99,7 @@ class Pool:
                 catalogue=catalogue,
                 site=msgspec.to_builtins(site),
                 on_death=on_death,
+                state=state,
             )
 
         self._keeper = Keeper(
@@ -113,6 +117,7 @@ class Pool:
             self._keeper,
             gateway=gateway,
             on_call=on_call,
+            state=state,
             refused=self.refused,
         )
         self.verbs = Verbs(config, self._keeper, gateway=gateway, catalogue=catalogue, refused=self.refused)
@@ -146,7 +151,7 @@ class Pool:
 
     def cold_ms(self, image: str) -> float:
         """Return what a cold start of an image is expected to take here, milliseconds."""
-        return self._keeper.costs.of(image)
+        return self._keeper.starts.costs.of(image)
 
     # --- life -----------------------------------------------------------------------------------------------
 

@@ -12,13 +12,14 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from appliance.errors import CancelledByOperatorError, PoolError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import Failure, Phase, RunEvent, RunEventKind, RunRequest
-from appliance.pool.books import FOR_A_RUN, IN_TURN
+from appliance.model import Failure, Need, Phase, RunEvent, RunEventKind, RunRequest
+from appliance.pool.books import FOR_A_RUN, FOR_STATE, IN_TURN
 from appliance.pool.container import Connection, PooledContainer
 from appliance.pool.conversation import Call, Conversation, order
 from appliance.pool.keeper import Keeper
 from appliance.pool.selection import Decision
 from appliance.pool.settings import PoolConfig
+from appliance.pool.state import State
 
 BACKSTOP_S = 3.0
 """How much longer than the runner itself the pool waits for a run to end, before it ends the container."""
@@ -47,9 +48,11 @@ class Runs:
         *,
         gateway: str,
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
+        state: State,
         refused: Counter[str],
     ) -> None:
         self._config = config
+        self._state = state
         self._keeper = keeper
         self._gateway = gateway
         self._on_call = on_call
@@ -72,19 +75,20 @@ class Runs:
         self._idle.clear()
         self._keeper.arrived(request.need.image)
         try:
-            container, connection, phase = await self._place(request, decision, run)
-            conversation = Conversation(
-                connection,
-                request,
-                gateway=self._gateway,
-                container=container.id,
-                phase=phase,
-                entered_ns=entered_ns,
-                on_event=on_event,
-                on_call=self._on_call,
-                refused=self._refused,
-            )
-            return await self._listen(request, run, container, connection, conversation)
+            async with contextlib.AsyncExitStack() as stack:
+                container, connection, phase = await self._place(request, decision, run, stack)
+                conversation = Conversation(
+                    connection,
+                    request,
+                    gateway=self._gateway,
+                    container=container.id,
+                    phase=phase,
+                    entered_ns=entered_ns,
+                    on_event=on_event,
+                    on_call=self._on_call,
+                    refused=self._refused,
+                )
+                return await self._listen(request, run, container, connection, conversation)
         except CancelledByOperatorError as error:
             return RunEvent(
                 task=request.task,
@@ -102,18 +106,22 @@ class Runs:
             self._keeper.ended(request.need.image, held_s)
 
     async def _place(
-        self, request: RunRequest, decision: Decision, run: _Run
+        self, request: RunRequest, decision: Decision, run: _Run, stack: contextlib.AsyncExitStack
     ) -> tuple[PooledContainer, Connection, Phase]:
-        """Get a container and send the run to it; one that turns out to be dead is replaced by another."""
-        keeper = self._keeper
+        """Get a container and send the run to it; one that turns out to be dead is replaced by another.
+
+        What the run has beyond its container, the use of its volumes, is put on `stack`.
+        """
+        keeper, need = self._keeper, request.need
         for _ in range(TRIES):
             container = keeper.books.claim(
-                request.need, container_id=decision.container or "", reservation=decision.reservation
+                need, container_id=decision.container or "", reservation=decision.reservation
             )
-            if container is None:
-                container = await self._acquire(request, run)
-                if container.reservation not in (FOR_A_RUN, IN_TURN):
-                    continue  # its lease ran out before this was told: the gateway stood still
+            if container is None or need.volumes:
+                container = await self._prepare(request, container, run)
+                if container.reservation not in (FOR_A_RUN, FOR_STATE, IN_TURN):
+                    continue  # its lease ran out while the gateway stood still
+                await self._use(need, container, stack)
             phase = Phase.COLD if container.reservation == FOR_A_RUN else Phase.LOCAL_WARM
             run.container = container
             run.began = time.monotonic()
@@ -130,8 +138,9 @@ class Runs:
                 raise
         raise PoolError(f"{TRIES} containers in a row were found dead", remedy="see the gateway's log")
 
-    async def _acquire(self, request: RunRequest, run: _Run) -> PooledContainer:
-        run.acquiring = asyncio.create_task(self._keeper.acquire(request.need), name=f"get {request.run_id}")
+    async def _prepare(self, request: RunRequest, claimed: PooledContainer | None, run: _Run) -> PooledContainer:
+        """Wait for a container and for the newest state of the volumes; an operator may cancel that."""
+        run.acquiring = asyncio.create_task(self._have(request.need, claimed), name=f"prepare {request.run_id}")
         try:
             return await run.acquiring
         except asyncio.CancelledError:
@@ -142,6 +151,35 @@ class Runs:
             if not run.cancelled:
                 raise
             raise CancelledByOperatorError(f"{request.run_id} was cancelled before it began") from None
+
+    async def _have(self, need: Need, claimed: PooledContainer | None) -> PooledContainer:
+        if not need.volumes:
+            return claimed or await self._keeper.acquire(need)
+        if claimed is not None:
+            self._keeper.books.keep(claimed)
+        # State comes while the container starts; both may take seconds.
+        bringing = asyncio.ensure_future(self._state.bring(need.volumes))
+        try:
+            container = claimed = claimed or await self._keeper.acquire(need)
+            self._keeper.books.keep(container)
+            await bringing
+        except BaseException:
+            bringing.cancel()
+            await asyncio.gather(bringing, return_exceptions=True)
+            if claimed is not None:
+                self._keeper.books.give_back(claimed)
+            raise
+        return container
+
+    async def _use(self, need: Need, container: PooledContainer, stack: contextlib.AsyncExitStack) -> None:
+        """Use the volumes from now until the run's end is told, so that what follows elsewhere finds what it left."""
+        if need.volumes:
+            await stack.aclose()  # of an earlier try
+            try:
+                await stack.enter_async_context(self._state.use(need.volumes))
+            except BaseException:
+                self._keeper.books.give_back(container)
+                raise
 
     async def _listen(
         self,
@@ -166,7 +204,10 @@ class Runs:
                 code, "the run did not end when told to; its container was ended", retryable=not run.cancelled
             )
         finally:
-            if ended:
+            if ended and request.need.volumes:
+                # What it left running may still write: swept first, so that what is noted of its state is the end.
+                await self._wind_up(container, connection, conversation)
+            elif ended:
                 self._keeper.spawn(self._wind_up(container, connection, conversation), f"wind up {container.id}")
             else:
                 connection.close()

@@ -19,7 +19,7 @@ import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import PoolError, SwiftbotError
+from appliance.errors import PoolError, PrerequisiteError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool import images
 from appliance.pool.container import SOCKET, PooledContainer
@@ -35,6 +35,7 @@ from appliance.pool.engine import (
     Found,
 )
 from appliance.pool.settings import PoolConfig
+from appliance.pool.state import State
 from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
 
 log = structlog.get_logger(__name__)
@@ -69,7 +70,9 @@ class Starter:
         catalogue: Catalogue,
         site: dict[str, Any],
         on_death: Callable[[PooledContainer], None],
+        state: State,
     ) -> None:
+        self._state = state
         self._config = config
         self._gateway = gateway
         self._fleet = fleet
@@ -110,11 +113,19 @@ class Starter:
             state=ContainerState.STARTING,
             cpu=size.cpu,
             memory_mb=size.memory_mb,
-            volumes=size.volumes,
+            volumes=tuple(each for each in size.volumes if self._state.newest_here(each)),
             compatible=self._catalogue.images[image].compatible,
             since_ns=time.time_ns(),
         )
-        return PooledContainer(info, self._run_dir / name, on_death=self._on_death)
+        return PooledContainer(info, self._run_dir / name, mounts=size.volumes, on_death=self._on_death)
+
+    def look_at_state(self, container: PooledContainer) -> bool:
+        """Bring up to date which of its volumes hold the newest state here; whether that changed anything."""
+        here = tuple(each for each in container.mounts if self._state.newest_here(each))
+        if here == container.info.volumes:
+            return False
+        container.info = replace(container.info, volumes=here)
+        return True
 
     async def start(self, container: PooledContainer, engine: Engine, facts: EngineFacts) -> None:
         """Create and start it and wait for its runner; what is left of a failed one is removed.
@@ -135,7 +146,7 @@ class Starter:
         try:
             for volume in spec.volumes:
                 await engine.ensure_volume(volume, self._labels)
-            container.engine_id = await engine.create(spec)
+            container.engine_id = await self._create(spec, engine)
             await engine.start(container.engine_id)
 
             await container.connect(timeout_s=self._config.start_timeout_s, alive=alive)
@@ -151,6 +162,20 @@ class Starter:
             self._proven.add(self._made(container.info.image))
         for what, problem in container.problems.items():
             log.warning("not preloaded", container=container.id, image=container.info.image, what=what, reason=problem)
+
+    async def _create(self, spec: ContainerSpec, engine: Engine) -> str:
+        """Create the container; an image that is not there is asked of the other gateways first."""
+        try:
+            return await engine.create(spec)
+        except PrerequisiteError as absent:
+            try:
+                await self._state.bring_image(spec.image)
+            except SwiftbotError as error:
+                raise PrerequisiteError(
+                    f"image {spec.image} is not on {self._gateway}: {error.message}", remedy=absent.remedy
+                ) from error
+            log.info("image brought", image=spec.image)
+            return await engine.create(spec)
 
     async def _discard(self, container: PooledContainer, engine: Engine) -> None:
         with contextlib.suppress(SwiftbotError):
@@ -191,13 +216,14 @@ class Starter:
             container.folder = self._run_dir / Path(name).name
             container.engine_id = found.id
             size = json.loads(found.labels.get(LABEL_SIZE, "{}"))
+            container.mounts = tuple(str(each) for each in size.get("volumes", ()))
             container.info = replace(
                 container.info,
                 id=name,
                 cpu=float(size.get("cpu", container.info.cpu)),
                 memory_mb=int(size.get("memory_mb", container.info.memory_mb)),
-                volumes=tuple(str(each) for each in size.get("volumes", ())),
             )
+            self.look_at_state(container)
             if found.labels.get(LABEL_STATE) != self._made(image):
                 reason = "made of another image, runner or handlers"
             else:
@@ -234,12 +260,13 @@ class Starter:
             if folder.is_dir() and folder.name not in known:
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def _reference(self, image: str) -> str:
+    def reference(self, image: str) -> str:
+        """Return the full name that Podman knows an image by."""
         return images.reference(self._catalogue.images[image], self._config)
 
     def _made(self, image: str) -> str:
         config = self._config
-        parts = (self._reference(image), self._code, config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
+        parts = (self.reference(image), self._code, config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
     def _roots(self, image: str) -> dict[str, str]:
@@ -278,7 +305,7 @@ class Starter:
         processes = 0 if facts.limits_enforced else config.user_processes
         inside = "/run/swiftbot"
         command = ("python3", "-s", "-m", "runner.main", "--socket", f"{inside}/{SOCKET}", "--spec", f"{inside}/{SPEC}")
-        size = {"cpu": info.cpu, "memory_mb": info.memory_mb, "volumes": info.volumes}
+        size = {"cpu": info.cpu, "memory_mb": info.memory_mb, "volumes": container.mounts}
         labels = {
             LABEL_ID: info.id,
             LABEL_IMAGE: info.image,
@@ -287,12 +314,12 @@ class Starter:
         }
         return ContainerSpec(
             name=f"swiftbot-{self._fleet}-{self._gateway}-{info.id}",
-            image=self._reference(info.image),
+            image=self.reference(info.image),
             command=(*command, "--processes", str(processes)),
             labels=self._labels | labels,
             binds=binds,
             writable=frozenset({str(container.folder)}),
-            volumes={f"swiftbot-{self._fleet}-{self._gateway}-{name}": f"/volumes/{name}" for name in info.volumes},
+            volumes={f"swiftbot-{self._fleet}-{self._gateway}-{name}": f"/volumes/{name}" for name in container.mounts},
             environment={
                 "PYTHONDONTWRITEBYTECODE": "1",
                 # `runner` is below /, what handlers share (`_lib`) below /skills.

@@ -20,14 +20,16 @@ from typing import Any
 
 import pytest
 
-from appliance.errors import PoolError, UnreachableError
+from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, Need, RunEvent, RunRequest, Site
+from appliance.pool import images
 from appliance.pool.engine import ContainerSpec, EngineFacts, Found, FoundImage
 from appliance.pool.pool import Call, Pool
 from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import RUNNER
+from appliance.pool.state import ALONE, State
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 HANDLER = """
@@ -181,6 +183,9 @@ class FakeEngine:
         self.scratch = scratch
         self.away = False
         self.refuse = ""
+        self.missing: set[str] = set()
+        """Images by name that are not there."""
+        self.references: dict[str, str] = {}
         self.specs: dict[str, ContainerSpec] = {}
         self.processes: dict[str, asyncio.subprocess.Process] = {}
         self.created = 0
@@ -206,6 +211,8 @@ class FakeEngine:
     async def create(self, spec: ContainerSpec) -> str:
         """Note it."""
         self._called("create")
+        if any(f"/{name}:" in spec.image for name in self.missing):
+            raise PrerequisiteError(f"create {spec.name}: the image is not there", remedy="build it")
         self.created += 1
         name = f"engine-{self.created}"
         self.specs[name] = spec
@@ -273,8 +280,10 @@ class FakeEngine:
         ]
 
     async def images(self) -> list[FoundImage]:
-        """Return none."""
-        return []
+        """Return those that are there."""
+        self._called("images")
+        there = [each for name, each in self.references.items() if name not in self.missing]
+        return [FoundImage(id="1", tags=(each,), size_bytes=1, created="") for each in there]
 
     async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
         """Do nothing."""
@@ -300,6 +309,7 @@ class Bench:
         self.folder = folder
         self.catalogue = catalogue
         self.engine = FakeEngine(folder)
+        self.engine.references = {name: images.reference(each, PoolConfig()) for name, each in catalogue.images.items()}
         self.pools: list[Pool] = []
         self.changes: list[tuple[ContainerInfo, ...]] = []
         self.calls: list[Call] = []
@@ -325,7 +335,7 @@ class Bench:
         """Offer what the test has put there for this image."""
         return [each for each in self.offers if each.container.image == need.image]
 
-    async def pool(self, *, gateway: str = "g1", fleet: str = "f1", **settings: Any) -> Pool:
+    async def pool(self, *, gateway: str = "g1", fleet: str = "f1", state: State = ALONE, **settings: Any) -> Pool:
         """Return a started pool."""
         settings = {"floor": {}, "cancel_grace_s": 0.3, "probe_s": 0.2, "mode": "local"} | settings
         pool = Pool(
@@ -338,6 +348,7 @@ class Bench:
             find_remote=self.find_remote,
             on_call=self.answer,
             on_change=self.changes.append,
+            state=state,
             make_engine=lambda: self.engine,
             read_memory=lambda: self.memory,
         )
@@ -349,12 +360,13 @@ class Bench:
     def request(number: int = 1, *, skill: str = "probe", image: str = "base", **more: Any) -> RunRequest:
         """Return an order to run a skill; `do` and others are its parameters."""
         deadline_s = more.pop("deadline_s", 10.0)
+        volumes = more.pop("volumes", ())
         return RunRequest(
             task="t",
             subtask=f"s{number}",
             attempt=1,
             skill=skill,
-            need=Need(image=image, cpu=0.1, memory_mb=64),
+            need=Need(image=image, cpu=0.1, memory_mb=64, volumes=volumes),
             params=more,
             deadline_s=deadline_s,
         )
