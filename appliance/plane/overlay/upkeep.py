@@ -20,6 +20,8 @@ _GONE_S = 120.0
 """How long hearsay does not bring back a member that was found gone; it can itself, at once."""
 _MOST_GONE = 1024
 _MOST_FIRST = 32
+_TRUST_S = 5.0
+"""How long a member that was heard from is not suspected."""
 
 
 class MeetAsk(Struct, frozen=True, omit_defaults=True):
@@ -98,7 +100,7 @@ class Upkeep:
         while self._first:
             name = self._first.pop()
             if name in view:
-                self.next_at = now
+                self.next_at = now + self._pace.least_s
                 return Meet(name)
         self.next_at = now + self.interval_s * self._rng.uniform(0.75, 1.25)
         self._turn = (self._turn + 1) % 4
@@ -121,7 +123,8 @@ class Upkeep:
         """The member met has answered."""
         self._seen[member] = now
         self._gone.pop(member, None)
-        suspects = self.view.unlisted(member, told)
+        # One that was heard from a moment ago is there, only its neighbour does not know it yet.
+        suspects = [name for name in self.view.unlisted(member, told) if now - self._seen.get(name, 0.0) > _TRUST_S]
         self._first = [*suspects, *self._first][-_MOST_FIRST:]
         usable = self._usable(told, now)
         new = self.view.merge(member, usable)

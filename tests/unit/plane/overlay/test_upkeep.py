@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.bench.dht.fleet import Fleet
-from appliance.plane.overlay.upkeep import MeetAsk, Pace, Upkeep
+from appliance.plane.overlay.upkeep import Meet, MeetAsk, Pace, Upkeep
 from appliance.plane.overlay.view import Around, View, bound_for, successor_count
 from appliance.plane.ring import Ring
 
@@ -138,3 +138,24 @@ def test_views_stay_bounded() -> None:
     view.trim(Fleet(bound=20).rng)
     assert len(view) == 20
     assert view.names[0] == ring.names[(place + 1) % 501]
+
+
+def test_members_that_leave_each_other_out_are_not_met_in_circles() -> None:
+    """Two members that are there but of which neither lists the other do not keep a third busy for ever."""
+    fleet = Fleet(bound=24).settled(f"gw-{n}" for n in range(50))
+    upkeep = fleet.members["gw-1"]
+    one, other = upkeep.view.names[1:3]
+    now, rounds = 100.0, 0
+    while now < 160.0:
+        match upkeep.due(now):
+            case Meet(member) if member in (one, other):
+                beyond = upkeep.view.names[3]
+                upkeep.met(member, Around(before=("gw-1",), after=(beyond,)), now)
+            case Meet(member):
+                upkeep.met(member, fleet.members[member].asked(MeetAsk("gw-1"), now), now)
+            case _:
+                upkeep.found((), now)
+        now = max(now, upkeep.next_at)
+        rounds += 1
+    assert {one, other} <= set(upkeep.view.names)
+    assert rounds < 60
