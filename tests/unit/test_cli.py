@@ -10,7 +10,8 @@ COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "fleet",
     "pool", "robots list", "robots qgc-actions", "log info", "log replay", "log recover",
     "log merge", "log trim", "log cat", "log pin", "sim mavlink", "sim zenoh", "images build", "images list", "doctor",
-    "tui", "bench startup", "pool list", "pool why", "pool warm", "pool evict", "pool release", "pool decisions",
+    "tui", "bench startup", "bench rate", "bench refill", "bench soak",
+    "bench table", "pool list", "pool why", "pool warm", "pool evict", "pool release", "pool decisions",
 ]  # fmt: skip
 
 
@@ -40,6 +41,8 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         (["log", "info", "{tmp}/none.mcap"], 4, "none.mcap"),
         (["log", "replay", "{tmp}/none.mcap"], 4, "none.mcap"),
         (["gateway", "--config", "{tmp}/none.toml"], 2, "none.toml"),
+        (["bench", "rate", "--rates", "0"], 2, "above 0"),
+        (["bench", "table", "{tmp}/none.json"], 4, "none.json"),
         (["sim", "mavlink", "--to", "nowhere"], 2, "nowhere"),
         (["sim", "mavlink", "--to", "udp://127.0.0.1:1", "--site", "atlantis"], 2, "atlantis"),
     ],
