@@ -100,7 +100,7 @@ class Gateway:
             gateway=config.id,
             site=site,
             on_task=self._on_robot_task,
-            tasks=Tasks(submit=self._submit_for_robot, cancel=self._cancel_for_robot),
+            tasks=Tasks(submit=self._submit_for_robot, cancel=self._cancel_for_robot, look=self._look_for_robot),
         )
         await self.hub.start()
         self._stack.push_async_callback(self.hub.stop)
@@ -239,6 +239,10 @@ class Gateway:
     async def _cancel_for_robot(self, task: str) -> TaskRecord:
         self._check_ready()
         return await self.manager.cancel(TaskAsk(id=task))
+
+    async def _look_for_robot(self, task: str) -> TaskRecord:
+        self._check_ready()
+        return await self.manager.task(TaskAsk(id=task))
 
     def _check_ready(self) -> None:
         if not self._ready.is_set() or self._draining:

@@ -25,6 +25,7 @@ from appliance.local_fleet import FleetState, Order
 from appliance.model import ContainerState, Phase, RobotCommand, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
+from appliance.robots.client import TaskClient, TaskRejected
 from appliance.robots.mavlink.requests import task_number
 from appliance.robots.settings import RobotsConfig, Template
 from appliance.tasks.replay import replay
@@ -54,7 +55,7 @@ async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
 async def test_a_task_by_mavlink(tmp_path: Path) -> None:
     """A ground station's button makes a task of the vehicle it addresses: acknowledged when durable, told to its end.
 
-    The repeated command is the same task, and the vehicle flies once.
+    The repeated command is the same task, and the vehicle flies once. Words through TUNNEL frames make one as well.
     """
     template = Template(id=7, instruction="{robot}: take off, then land")
     order = Order(
@@ -81,12 +82,18 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
                     answers.append((found.result, found.result_param2))
             while not any("succeeded" in text for text in texts):
                 texts.append(ground.recv_match(type="STATUSTEXT", blocking=True, timeout=60).text)
+            client = TaskClient(ground, gateway=(1, 191))
+            client.submit("drone_1: take off, then land", task="in-words")
+            texts.append(list(client.follow("in-words", timeout_s=60))[-1]["state"])
+            with pytest.raises(TaskRejected, match="is empty"):
+                client.submit(" ")
         finally:
             ground.close()
         return answers, texts
 
     try:
         answers, texts = await asyncio.to_thread(station)
+        assert texts.pop() == "succeeded"
         task = texts[-1].split()[0]
         assert [result for result, _ in answers] == [5, 0, 0]
         assert answers[1] == answers[2] == (0, task_number(task))
@@ -97,6 +104,7 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
     finally:
         await local_fleet.down(order.directory, progress=print)
     assert set(commands_in(state, task).values()) == {1}
+    assert set(commands_in(state, "in-words").values()) == {1}
 
 
 async def wait_for(client: FleetClient, task: str) -> TaskRecord:

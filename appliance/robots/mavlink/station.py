@@ -8,10 +8,10 @@ Ground stations on any link are its guests: frames pass between them and the veh
 
 import asyncio
 import contextlib
+import time
 from collections import Counter
 from collections.abc import Callable
 
-import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
@@ -23,10 +23,12 @@ from appliance.robots.ledger import KeyValues, Ledger
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.copter import Copter
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
+from appliance.robots.mavlink.keeping import REMEMBER_S, load_signer, remember
+from appliance.robots.mavlink.letters import LetterDesk
 from appliance.robots.mavlink.links import Address, Link, open_link
 from appliance.robots.mavlink.requests import RequestDesk
 from appliance.robots.mavlink.routing import BROADCAST, End, Passage, Router, Rules
-from appliance.robots.mavlink.signing import Memory, Signer, read_key
+from appliance.robots.mavlink.tunnel import PAYLOAD_TYPE
 from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 
@@ -38,13 +40,6 @@ _OFFLINE_INFO_S = 5.0
 """How often the roster is reminded of a vehicle that is offline."""
 _STREAMS_HZ = {"GLOBAL_POSITION_INT": 5.0, "SYS_STATUS": 1.0, "MISSION_CURRENT": 2.0, "HOME_POSITION": 0.2}
 """What is asked of a vehicle that has come online; ArduPilot sends little of it by itself."""
-
-_REMEMBER_S = 5.0
-"""How often the times of signed links are kept; what a crash forgets may be replayed within a minute."""
-
-
-def _signing_key(link: MavlinkLink) -> str:
-    return f"mavlink/signing/{link.remote}"
 
 
 class _Attached:
@@ -99,6 +94,7 @@ class Station:
         ]
         self._router = Router(rules, own_system=config.system_id)
         self._requests = RequestDesk(config.templates, tasks=tasks, store=store, refused=refused)
+        self._letters = LetterDesk(tasks=tasks, refused=refused, clock=time.monotonic)
         self._records: Closer | None = None
         self._others: set[str] = set()
         self._watch: Closer | None = None
@@ -114,7 +110,7 @@ class Station:
         """Bind the ports and begin; ConfigError with the remedy when a port is taken."""
         try:
             for index, link in enumerate(self._config.mavlink):
-                signer = await self._signer(index, link)
+                signer = await load_signer(link, index, self._store)
                 codec = Codec(self._config.system_id, self._config.component_id, signer=signer)
                 self._links.append(await open_link(link.remote, codec, self._receiver(index, link), self.refused))
                 log.info("MAVLink link open", link=str(link.remote), listens=link.remote.listens)
@@ -126,26 +122,6 @@ class Station:
         self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
         self._ticking = asyncio.create_task(self._tick(), name="robot hub")
 
-    async def _signer(self, index: int, link: MavlinkLink) -> Signer | None:
-        """Return the key of a link with what it knew before, so that nothing old is believed after a restart."""
-        if not link.signing:
-            return None
-        key = await asyncio.to_thread(read_key, link.signing)
-        name = _signing_key(link)
-        kept = dict(await self._store.scan(name)).get(name)
-        try:
-            memory = msgspec.json.decode(kept, type=Memory) if kept else Memory()
-        except msgspec.DecodeError as error:
-            log.warning("what a signed link knew is lost", link=str(link.remote), reason=str(error))
-            memory = Memory()
-        return Signer(key, link_id=index % 256, memory=memory)
-
-    async def _remember(self) -> None:
-        """Keep the times of signed links."""
-        for link, settings in zip(self._links, self._config.mavlink, strict=False):
-            if link.codec.signer is not None:
-                await self._store.put(_signing_key(settings), encode(link.codec.signer.memory))
-
     async def stop(self) -> None:
         """End commands (they are resumed by the next process), take back what was declared, close the ports."""
         for task in (self._ticking, *self._attaching):
@@ -155,6 +131,7 @@ class Station:
                     await task
         self._ticking = None
         await self._requests.close()
+        await self._letters.close()
         if self._records is not None:
             self._records.close()
             self._records = None
@@ -170,7 +147,7 @@ class Station:
         self._by_source.clear()
         for link in self._links:
             await link.close()
-        await self._remember()
+        await remember(self._links, self._config.mavlink, self._store)
         self._links.clear()
         if self._watch is not None:
             self._watch.close()
@@ -212,12 +189,13 @@ class Station:
             self._route(frame, End(index, address), now)
 
     def _ask(self, frame: Frame, source: End, sender: _Attached | None) -> bool:
-        """Take a command for the gateway as an onboard computer: of its own system, or of a vehicle's.
+        """Take a command or message for the gateway as an onboard computer: of its own system, or of a vehicle's.
 
         Ground stations know vehicles, not gateways: their buttons address component 191 of the vehicle's system. Where
         a real companion computer has that number, the command is its.
         """
-        if frame.name not in ("COMMAND_LONG", "COMMAND_INT"):
+        tunnel = frame.name == "TUNNEL" and frame.message.payload_type == PAYLOAD_TYPE
+        if not tunnel and frame.name not in ("COMMAND_LONG", "COMMAND_INT"):
             return False
         system, component = frame.message.target_system, frame.message.target_component
         if component != self._config.component_id:
@@ -236,13 +214,14 @@ class Station:
                     name = sender.vehicle.name
                     self._session.put(self._session.keys.mavlink(name, "tx"), raw, encoding=FRAME_ENCODING)
 
-        self._requests.take(frame, robot=robot, reply=reply)
+        (self._letters if tunnel else self._requests).take(frame, robot=robot, reply=reply)
         return True
 
     def _on_record(self, key: str, record: TaskRecord | None) -> None:
         del key
         if record is not None:
             self._requests.news(record)
+            self._letters.news(record)
 
     def _is_guest(self, index: int, frame: Frame) -> bool:
         """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer."""
@@ -391,13 +370,13 @@ class Station:
     async def _tick(self) -> None:
         """Send heartbeats, notice lost ones, tell the roster."""
         loop = asyncio.get_running_loop()
-        beat_at, remember_at = 0.0, loop.time() + _REMEMBER_S
+        beat_at, remember_at = 0.0, loop.time() + REMEMBER_S
         while True:
             now = loop.time()
             if now >= remember_at:
-                remember_at = now + _REMEMBER_S
+                remember_at = now + REMEMBER_S
                 with contextlib.suppress(SwiftbotError):  # a disk that is full now may not be so the next time
-                    await self._remember()
+                    await remember(self._links, self._config.mavlink, self._store)
             if now >= beat_at:
                 beat_at = now + self._config.heartbeat_s
                 self._beat()
@@ -407,6 +386,7 @@ class Station:
                 interval = 1.0 / self._config.state_hz if each.vehicle.online else _OFFLINE_INFO_S
                 if each.queryable is not None and (each.tell or now - each.told_at >= interval):
                     self._tell(each)
+            self._letters.tick()
             await asyncio.sleep(_TICK_S)
 
     def _beat(self) -> None:

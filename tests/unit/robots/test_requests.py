@@ -40,7 +40,7 @@ class Fleet:
 
     def new_desk(self) -> RequestDesk:
         """Return a desk on the same store, as after a restart."""
-        tasks = Tasks(submit=self.submit, cancel=self.cancel)
+        tasks = Tasks(submit=self.submit, cancel=self.cancel, look=self.cancel)
         return RequestDesk(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:

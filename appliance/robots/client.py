@@ -1,0 +1,190 @@
+"""What a robot's companion computer, or a script beside a ground station, asks tasks of the fleet with, over MAVLink.
+
+Needs pymavlink and, of this project, the one module `appliance.robots.mavlink.tunnel`; both files can be copied. The
+connection is an ordinary one of `pymavlink.mavutil`; messages that are not for this client go to `on_other`.
+
+    connection = mavutil.mavlink_connection("udpout:gateway:14550", source_system=1, source_component=192)
+    client = TaskClient(connection)
+    task = client.submit("photograph the gate, then come home")
+    for news in client.follow(task):
+        print(news["state"], news.get("done"), news.get("total"))
+
+`AsyncTaskClient` is the same for asyncio.
+"""
+
+import asyncio
+import json
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any, cast
+
+from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel, NotDelivered
+
+FINAL = frozenset({"succeeded", "failed", "cancelled"})
+"""States after which nothing follows."""
+POLL_S = 0.05
+MAX_NEWS = 1000
+"""Messages kept that nobody asked for yet."""
+
+News = dict[str, Any]
+
+
+class TaskRejected(Exception):  # noqa: N818 - what it says
+    """The fleet will not do it. `retry` tells whether it may later; `code` and `remedy` are the gateway's."""
+
+    def __init__(self, message: str, *, code: str = "", remedy: str = "", retry: bool = False) -> None:
+        super().__init__(message)
+        self.code = code
+        self.remedy = remedy
+        self.retry = retry
+
+
+class TaskClient:
+    """Asks for tasks and hears of them. Not for several threads at once.
+
+    Args:
+        connection: of `pymavlink.mavutil`, MAVLink 2.
+        gateway: system and component id of the gateway.
+        on_other: given every message that is not this client's.
+    """
+
+    def __init__(
+        self, connection: Any, *, gateway: tuple[int, int] = (245, 191), on_other: Callable[[Any], None] | None = None
+    ) -> None:
+        self._connection = connection
+        self._gateway = gateway
+        self._on_other = on_other
+        self._channel = Channel(lambda: secrets.randbits(32))
+        self._news: deque[News] = deque(maxlen=MAX_NEWS)
+
+    def submit(self, instruction: str, *, task: str = "", timeout_s: float = 60.0) -> str:
+        """Ask for a task; returns its id once it is durable.
+
+        Args:
+            instruction: what to do, in words.
+            task: its id; asked again with the same one, it is the same task. Made up when empty.
+            timeout_s: how long the fleet is waited for.
+
+        Raises:
+            TaskRejected: it will not be done, and why.
+            TimeoutError: nothing was heard; asking again with the same id is safe.
+        """
+        task = task or f"r-{secrets.token_hex(6)}"
+        self._ask({"op": "submit", "id": task, "instruction": instruction}, timeout_s)
+        return task
+
+    def cancel(self, task: str, *, timeout_s: float = 60.0) -> str:
+        """Stop a task; returns its state. Errors as `submit`."""
+        return str(self._ask({"op": "cancel", "id": task}, timeout_s).get("state", ""))
+
+    def follow(self, task: str, *, timeout_s: float = 3600.0, again: bool = False) -> Iterator[News]:
+        """Yield a task's news until it ends.
+
+        Args:
+            task: id of a task submitted here; or of another one, with `again`.
+            timeout_s: TimeoutError when it has not ended by then.
+            again: ask to be told, as after a restart. Errors then as `submit`.
+        """
+        until = time.monotonic() + timeout_s
+        if again:
+            self._ask({"op": "follow", "id": task}, timeout_s)
+        while True:
+            found = self._wait(lambda news: news.get("op") == "news" and news.get("id") == task, until)
+            yield found
+            if found.get("state") in FINAL:
+                return
+
+    def pump(self, timeout_s: float = POLL_S) -> None:
+        """Send what is due and take in what comes; the other methods do so while they wait."""
+        for payload in self._channel.due(time.monotonic()):
+            self._connection.mav.tunnel_send(
+                *self._gateway, PAYLOAD_TYPE, len(payload), list(payload.ljust(MAX_PAYLOAD, b"\0"))
+            )
+        message = self._connection.recv_match(blocking=True, timeout=timeout_s)
+        while message is not None:
+            self.handle(message)
+            message = self._connection.recv_match(blocking=False)
+
+    def handle(self, message: Any) -> None:
+        """Take in one message, for those who read the connection themselves."""
+        mine = message.get_type() == "TUNNEL" and message.payload_type == PAYLOAD_TYPE
+        if not mine or (message.get_srcSystem(), message.get_srcComponent()) != self._gateway:
+            if self._on_other is not None:
+                self._on_other(message)
+            return
+        whole = self._channel.take(bytes(message.payload[: message.payload_length]), time.monotonic())
+        if whole is not None:
+            try:
+                news = json.loads(whole)
+            except ValueError:
+                return
+            if isinstance(news, dict):
+                self._news.append(cast("News", news))
+
+    def _ask(self, letter: dict[str, str], timeout_s: float) -> News:
+        until = time.monotonic() + timeout_s
+        try:
+            number = self._channel.send(json.dumps(letter).encode(), time.monotonic())
+        except NotDelivered as error:
+            raise TaskRejected(str(error), code="payload") from error
+        answers = ("accepted", "rejected")
+
+        def answered(news: News) -> bool:
+            return news.get("op") in answers and news.get("id") in (letter["id"], "")
+
+        answer = self._wait(answered, until, number)
+        if answer["op"] == "rejected":
+            raise TaskRejected(
+                str(answer.get("message", "")),
+                code=str(answer.get("code", "")),
+                remedy=str(answer.get("remedy", "")),
+                retry=bool(answer.get("retry", False)),
+            )
+        return answer
+
+    def _wait(self, wanted: Callable[[News], bool], until: float, number: int | None = None) -> News:
+        while True:
+            for news in self._news:
+                if wanted(news):
+                    self._news.remove(news)
+                    return news
+            if number is not None and number in self._channel.failed:
+                why = self._channel.failed.pop(number)
+                if why.startswith("nothing was heard"):
+                    raise TimeoutError(f"the gateway does not answer: {why}")
+                raise TaskRejected(why, code="payload")
+            if time.monotonic() > until:
+                raise TimeoutError("the gateway does not answer in time; asking again with the same id is safe")
+            self.pump()
+
+
+class AsyncTaskClient:
+    """The same for asyncio; arguments as `TaskClient`. Each call runs in a thread, one at a time."""
+
+    def __init__(self, connection: Any, **options: Any) -> None:
+        self._client = TaskClient(connection, **options)
+        self._lock = threading.Lock()
+
+    async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 60.0) -> str:
+        """As `TaskClient.submit`."""
+        return await self._run(lambda: self._client.submit(instruction, task=task, timeout_s=timeout_s))
+
+    async def cancel(self, task: str, *, timeout_s: float = 60.0) -> str:
+        """As `TaskClient.cancel`."""
+        return await self._run(lambda: self._client.cancel(task, timeout_s=timeout_s))
+
+    async def follow(self, task: str, *, timeout_s: float = 3600.0, again: bool = False) -> AsyncIterator[News]:
+        """As `TaskClient.follow`."""
+        news = self._client.follow(task, timeout_s=timeout_s, again=again)
+        while (found := await self._run(lambda: next(news, None))) is not None:
+            yield found
+
+    async def _run(self, work: Callable[[], Any]) -> Any:
+        def locked() -> Any:
+            with self._lock:
+                return work()
+
+        return await asyncio.to_thread(locked)

@@ -1,0 +1,224 @@
+"""Tasks asked for in words over MAVLink: JSON messages through TUNNEL frames (`tunnel`).
+
+From a robot or ground station:
+
+    {"op": "submit", "id": "r1-42", "instruction": "..."}   the sender chooses the id: sent again, it is the same task
+    {"op": "follow", "id": "r1-42"}                         tell how a task goes on, after a restart of the sender
+    {"op": "cancel", "id": "r1-42"}
+
+and back:
+
+    {"op": "accepted", "id", "state"}                       durable on its replicas
+    {"op": "rejected", "id", "code", "message", "remedy", "retry"}
+    {"op": "news", "id", "state", "done", "total", "message"}   on each change, until a final state
+"""
+
+import asyncio
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Literal
+
+import msgspec
+import structlog
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
+from appliance.model import TaskRecord, TaskRequest, encode
+from appliance.robots.doors import Tasks
+from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink.dialect import Frame, Message
+from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel, NotDelivered
+
+log = structlog.get_logger(__name__)
+
+MAX_SENDERS = 64
+"""Other ends with a conversation; the longest silent one is forgotten first."""
+MAX_AT_WORK = 16
+"""Messages being carried out at once."""
+MAX_FOLLOWED = 1000
+"""Tasks whose senders are told how they go on; the oldest is forgotten first."""
+_PASSING = (RefusedError, UnreachableError, DeadlineError)
+
+
+class Letter(Struct, frozen=True, kw_only=True):
+    """What a sender wants. Fields of later versions are ignored."""
+
+    op: Literal["submit", "follow", "cancel"]
+    id: str
+    instruction: str = ""
+
+
+class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What it is told."""
+
+    op: Literal["accepted", "rejected", "news"]
+    id: str
+    state: str = ""
+    done: int = 0
+    total: int = 0
+    code: str = ""
+    message: str = ""
+    remedy: str = ""
+    retry: bool = False
+
+
+class _Sender:
+    """One other end."""
+
+    def __init__(self, name: str, reply: Callable[[Message], None]) -> None:
+        self.name = name
+        self.reply = reply
+        self.channel = Channel(lambda: secrets.randbits(32))
+
+
+class LetterDesk:
+    """Takes messages and answers them.
+
+    Args:
+        tasks: the fleet's tasks; None where this gateway takes none, which is answered so.
+        refused: counters of bad input.
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, *, tasks: Tasks | None, refused: dict[str, int], clock: Callable[[], float]) -> None:
+        self._tasks = tasks
+        self._refused = refused
+        self._clock = clock
+        self._senders: OrderedDict[tuple[int, int], _Sender] = OrderedDict()
+        self._followed: OrderedDict[str, tuple[_Sender, bytes]] = OrderedDict()
+        """Task -> who is told, and what was told last."""
+        self._at_work: set[asyncio.Task[None]] = set()
+
+    async def close(self) -> None:
+        """Stop; whoever had no answer sends again."""
+        for task in self._at_work:
+            task.cancel()
+        await asyncio.gather(*self._at_work, return_exceptions=True)
+
+    def take(self, frame: Frame, *, robot: str, reply: Callable[[Message], None]) -> None:
+        """Take a TUNNEL frame of this protocol that is for this gateway; arguments as `RequestDesk.take`."""
+        message = frame.message
+        key = (frame.system, frame.component)
+        sender = self._senders.get(key)
+        if sender is None:
+            sender = self._senders[key] = _Sender(robot or f"mavlink-{frame.system}-{frame.component}", reply)
+            while len(self._senders) > MAX_SENDERS:
+                self._senders.popitem(last=False)
+        self._senders.move_to_end(key)
+        sender.reply = reply
+        payload = bytes(message.payload[: min(message.payload_length, MAX_PAYLOAD)])
+        before = sender.channel.malformed
+        whole = sender.channel.take(payload, self._clock())
+        if sender.channel.malformed > before:
+            self._count("tunnel_malformed")
+        if whole is not None:
+            self._read(sender, whole)
+
+    def tick(self) -> None:
+        """Send what is due; to be called some twenty times a second."""
+        now = self._clock()
+        for (system, component), sender in self._senders.items():
+            for payload in sender.channel.due(now):
+                sender.reply(
+                    dialect.make(
+                        "TUNNEL",
+                        target_system=system,
+                        target_component=component,
+                        payload_type=PAYLOAD_TYPE,
+                        payload_length=len(payload),
+                        payload=list(payload.ljust(MAX_PAYLOAD, b"\0")),
+                    )
+                )
+            for number in list(sender.channel.failed):
+                log.info(
+                    "an answer over MAVLink was not delivered", to=sender.name, reason=sender.channel.failed[number]
+                )
+                del sender.channel.failed[number]
+
+    def news(self, record: TaskRecord) -> None:
+        """Tell a task's sender how it goes on."""
+        found = self._followed.get(record.id)
+        if found is None:
+            return
+        sender, told = found
+        said = encode(_news(record))
+        if said != told:
+            self._followed[record.id] = (sender, said)
+            self._send(sender, said)
+        if record.state.final:
+            del self._followed[record.id]
+
+    # --- inside ------------------------------------------------------------------------------------------------
+
+    def _read(self, sender: _Sender, data: bytes) -> None:
+        try:
+            letter = msgspec.json.decode(data, type=Letter)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            self._count("tunnel_malformed")
+            self._say(sender, Answer(op="rejected", id="", code="payload", message=f"not understood: {error}"))
+            return
+        if len(self._at_work) >= MAX_AT_WORK:
+            self._reject(sender, letter, RefusedError("too many messages are being carried out"))
+            return
+        work = asyncio.create_task(self._carry_out(sender, letter), name=f"MAVLink letter of {sender.name}")
+        self._at_work.add(work)
+        work.add_done_callback(self._at_work.discard)
+
+    async def _carry_out(self, sender: _Sender, letter: Letter) -> None:
+        try:
+            if self._tasks is None:
+                raise RefusedError("this gateway takes no tasks")
+            self._follow(letter.id, sender)
+            if letter.op == "submit":
+                request = TaskRequest(instruction=letter.instruction, id=letter.id, submitter=sender.name)
+                record = await self._tasks.submit(request)
+                log.info("task by MAVLink", task=record.id, sender=sender.name, instruction=letter.instruction[:200])
+            elif letter.op == "cancel":
+                record = await self._tasks.cancel(letter.id)
+            else:
+                record = await self._tasks.look(letter.id)
+        except SwiftbotError as error:
+            self._followed.pop(letter.id, None)
+            self._reject(sender, letter, error)
+            return
+        self._say(sender, Answer(op="accepted", id=letter.id, state=record.state))
+        if record.sequence > 1:
+            self.news(record)
+
+    def _follow(self, task: str, sender: _Sender) -> None:
+        self._followed[task] = (sender, b"")
+        while len(self._followed) > MAX_FOLLOWED:
+            self._followed.popitem(last=False)
+
+    def _reject(self, sender: _Sender, letter: Letter, error: SwiftbotError) -> None:
+        passing = isinstance(error, _PASSING)
+        self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
+        log.warning("what was asked by MAVLink is refused", sender=sender.name, op=letter.op, reason=str(error))
+        answer = Answer(
+            op="rejected", id=letter.id, code=error.code, message=error.message, remedy=error.remedy, retry=passing
+        )
+        self._say(sender, answer)
+
+    def _say(self, sender: _Sender, answer: Answer) -> None:
+        self._send(sender, encode(answer))
+
+    def _send(self, sender: _Sender, data: bytes) -> None:
+        try:
+            sender.channel.send(data, self._clock())
+        except NotDelivered as error:
+            log.warning("an answer over MAVLink was not sent", to=sender.name, reason=str(error))
+
+    def _count(self, what: str) -> None:
+        self._refused[what] = self._refused.get(what, 0) + 1
+
+
+def _news(record: TaskRecord) -> Answer:
+    return Answer(
+        op="news",
+        id=record.id,
+        state=record.state,
+        done=sum(each.state.final for each in record.subtasks),
+        total=len(record.subtasks),
+        message=record.failure.message[:1000] if record.failure else "",
+    )

@@ -1,0 +1,172 @@
+"""Tasks asked for in words over MAVLink: each accepted once over a bad link, and answered; nonsense costs nothing."""
+
+import asyncio
+import itertools
+import random
+from collections import Counter
+
+import msgspec
+import pytest
+
+from appliance.errors import NotFoundError, RefusedError, SwiftbotError
+from appliance.model import TaskRecord, TaskRequest, TaskState
+from appliance.robots.doors import Tasks
+from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
+from appliance.robots.mavlink.letters import Answer, LetterDesk
+from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel
+
+pytestmark = pytest.mark.anyio
+
+
+class Air:
+    """A gateway's desk, a robot's channel, and a link between them that loses, doubles and reorders."""
+
+    def __init__(self, *, loss: float = 0.0, tasks: bool = True) -> None:
+        self.now = 0.0
+        self.loss = loss
+        self.chance = random.Random(5)  # noqa: S311 - a bad radio, no secret
+        self.submitted: Counter[str] = Counter()
+        self.error: SwiftbotError | None = None
+        self.refused: dict[str, int] = {}
+        doors = Tasks(submit=self.submit, cancel=self.look, look=self.look) if tasks else None
+        self.desk = LetterDesk(tasks=doors, refused=self.refused, clock=lambda: self.now)
+        self.robot = Channel(itertools.count(7).__next__)
+        self.codec, self.reader = Codec(1, 192), Codec(245, 191)
+        self.up: list[tuple[float, bytes]] = []
+        self.down: list[tuple[float, bytes]] = []
+        self.answers: list[Answer] = []
+
+    async def submit(self, request: TaskRequest) -> TaskRecord:
+        """Take a task."""
+        if self.error is not None:
+            raise self.error
+        self.submitted[request.id] += 1
+        return TaskRecord(id=request.id, instruction=request.instruction, sequence=1)
+
+    async def look(self, task: str) -> TaskRecord:
+        """Tell how a task stands."""
+        if task not in self.submitted:
+            raise NotFoundError(f"no task {task}")
+        return TaskRecord(id=task, instruction="", state=TaskState.RUNNING, sequence=3)
+
+    def _send(self, air: list[tuple[float, bytes]], payload: bytes) -> None:
+        while self.chance.random() >= self.loss:
+            air.append((self.now + self.chance.uniform(0, 0.3), payload))
+            if self.chance.random() >= self.loss:
+                break
+
+    def _land(self, air: list[tuple[float, bytes]]) -> list[bytes]:
+        landed = [payload for at, payload in air if at <= self.now]
+        air[:] = [each for each in air if each[0] > self.now]
+        self.chance.shuffle(landed)
+        return landed
+
+    def frame(self, payload: bytes) -> Frame:
+        """Return a payload as the gateway's frame."""
+        raw = self.codec.pack(
+            make(
+                "TUNNEL", target_system=245, target_component=191, payload_type=PAYLOAD_TYPE,
+                payload_length=len(payload), payload=list(payload.ljust(MAX_PAYLOAD, b"\0")),
+            )
+        )  # fmt: skip
+        (frame,) = self.reader.read(raw)
+        assert isinstance(frame, Frame)
+        return frame
+
+    def reply(self, message: Message) -> None:
+        """Take what the desk sends."""
+        self._send(self.down, bytes(message.payload[: message.payload_length]))
+
+    async def step(self) -> None:
+        """Let 50 ms pass."""
+        self.now += 0.05
+        for payload in self.robot.due(self.now):
+            self._send(self.up, payload)
+        for payload in self._land(self.up):
+            self.desk.take(self.frame(payload), robot="drone_1", reply=self.reply)
+        self.desk.tick()
+        for payload in self._land(self.down):
+            whole = self.robot.take(payload, self.now)
+            if whole is not None:
+                self.answers.append(msgspec.json.decode(whole, type=Answer))
+        for _ in range(3):
+            await asyncio.sleep(0)
+
+    async def ask(self, data: bytes) -> Answer:
+        """Send a message and return the next answer."""
+        before = len(self.answers)
+        self.robot.send(data, self.now)
+        while len(self.answers) == before:
+            await self.step()
+            assert self.now < 600
+        return self.answers[-1]
+
+
+def letter(op: str, task: str, instruction: str = "") -> bytes:
+    """Return a message."""
+    return msgspec.json.encode({"op": op, "id": task, "instruction": instruction})
+
+
+async def test_a_thousand_tasks_over_a_bad_link() -> None:
+    """With a fifth of all frames lost, doubled and reordered, 1,000 tasks are accepted once each, and told so."""
+    air = Air(loss=0.2)
+    waiting = [f"t{number}" for number in range(1000)]
+    while len(air.answers) < 1000:
+        while waiting and len(air.robot._going) < 4:
+            task = waiting.pop()
+            air.robot.send(letter("submit", task, f"look at gate {task} and tell me whether it is shut " * 4), air.now)
+        await air.step()
+        assert air.now < 3000
+    assert air.submitted == Counter(f"t{number}" for number in range(1000))
+    assert Counter((each.op, each.id) for each in air.answers) == Counter(
+        ("accepted", f"t{number}") for number in range(1000)
+    )
+
+
+async def test_news_until_the_end() -> None:
+    """Each change of a task is told once, also to one that asks to follow it, and nothing after its end."""
+    air = Air()
+    assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
+    assert (await air.ask(letter("follow", "t1"))).state == "running"
+    running = TaskRecord(id="t1", instruction="", state=TaskState.RUNNING, sequence=4)
+    done = msgspec.structs.replace(running, state=TaskState.SUCCEEDED)
+    for record in (running, done, running):
+        air.desk.news(record)
+    for _ in range(40):
+        await air.step()
+    assert [each.state for each in air.answers if each.op == "news"] == ["running", "succeeded"]
+
+
+async def test_refusals_have_their_reason() -> None:
+    """What is refused comes back with code, message and whether it may be asked again."""
+    air = Air()
+    air.error = RefusedError("too many tasks", remedy="wait")
+    answer = await air.ask(letter("submit", "t1", "go"))
+    assert (answer.op, answer.code, answer.message, answer.remedy, answer.retry) == (
+        "rejected", "refused", "too many tasks", "wait", True,
+    )  # fmt: skip
+    answer = await air.ask(letter("cancel", "t9"))
+    assert (answer.op, answer.code, answer.retry) == ("rejected", "not-found", False)
+    assert (await Air(tasks=False).ask(letter("submit", "t1", "go"))).message == "this gateway takes no tasks"
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff", b"[1]", b'{"op":"fly","id":"x"}', b'{"op":"submit"}', b"[" * 5000])
+async def test_messages_that_are_none(data: bytes) -> None:
+    """What is no message is answered so and counted; the next one is taken."""
+    air = Air()
+    answer = await air.ask(data)
+    assert (answer.op, answer.code) == ("rejected", "payload")
+    assert air.refused == {"tunnel_malformed": 1}
+    assert (await air.ask(letter("submit", "t1", "go"))).op == "accepted"
+
+
+async def test_payloads_that_are_none() -> None:
+    """Truncated, foreign and oversize payloads are counted, and many senders cost no more memory than some."""
+    air = Air()
+    for payload in (b"", b"SB", b"XX\x01\x01" + bytes(12), b"SB\x01\x09" + bytes(12)):
+        air.desk.take(air.frame(payload), robot="", reply=air.reply)
+    assert air.refused["tunnel_malformed"] >= 3
+    for system in range(1, 200):
+        air.codec = Codec(system, 1)
+        air.desk.take(air.frame(b""), robot="", reply=air.reply)
+    assert len(air.desk._senders) == 64

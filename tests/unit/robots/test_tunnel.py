@@ -1,0 +1,130 @@
+"""Messages through TUNNEL frames: delivered once, whole, in spite of the link; hostile payloads cost nothing."""
+
+import itertools
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.robots.mavlink.tunnel import MAX_BYTES, MAX_GOING, MAX_PAYLOAD, Channel, NotDelivered
+
+
+class Radio:
+    """Two ends and a link that loses, doubles and reorders; time passes in steps."""
+
+    def __init__(self, *, loss: float, seed: int) -> None:
+        self.chance = random.Random(seed)  # noqa: S311 - a bad radio, no secret
+        self.loss = loss
+        self.now = 0.0
+        numbers = itertools.count(seed << 8)
+        self.ends = (Channel(lambda: next(numbers)), Channel(lambda: next(numbers)))
+        self.got: tuple[list[bytes], list[bytes]] = ([], [])
+        self.air: list[tuple[float, int, bytes]] = []
+        self.frames = 0
+
+    def step(self) -> None:
+        """Let 50 ms pass."""
+        self.now += 0.05
+        for side in (0, 1):
+            for payload in self.ends[side].due(self.now):
+                assert len(payload) <= MAX_PAYLOAD
+                self.frames += 1
+                while self.chance.random() >= self.loss:
+                    self.air.append((self.now + self.chance.uniform(0, 0.4), 1 - side, payload))
+                    if self.chance.random() >= self.loss:
+                        break
+        landed = [each for each in self.air if each[0] <= self.now]
+        self.air = [each for each in self.air if each[0] > self.now]
+        self.chance.shuffle(landed)
+        for _, side, payload in landed:
+            whole = self.ends[side].take(payload, self.now)
+            if whole is not None:
+                self.got[side].append(whole)
+
+
+letters = st.lists(st.binary(max_size=2000), max_size=6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.binary(max_size=2000), max_size=6), st.lists(st.binary(max_size=2000), max_size=6), st.integers(0, 999)
+)
+def test_everything_arrives_once_over_a_bad_link(one: list[bytes], two: list[bytes], seed: int) -> None:
+    """With a fifth of all frames lost, doubled and out of order, both ways, each message arrives once and whole."""
+    radio = Radio(loss=0.2, seed=seed)
+    sent = [(side, radio.ends[side].send(data, 0.0)) for side, some in ((0, one), (1, two)) for data in some]
+    while any(radio.ends[side].going(number) for side, number in sent):
+        radio.step()
+        assert radio.now < 300
+    assert not radio.ends[0].failed
+    assert not radio.ends[1].failed
+    assert sorted(radio.got[1]) == sorted(one)
+    assert sorted(radio.got[0]) == sorted(two)
+
+
+def test_a_good_link_wastes_nothing() -> None:
+    """Without loss each part is sent once, and a message of many parts is acknowledged in a few frames."""
+    radio = Radio(loss=0.0, seed=1)
+    number = radio.ends[0].send(bytes(5000), 0.0)
+    while radio.ends[0].going(number):
+        radio.step()
+    assert radio.got[1] == [bytes(5000)]
+    assert radio.frames <= 45 + 45
+
+
+def test_nobody_there() -> None:
+    """A message that nobody acknowledges fails after a minute, with the reason, and is sent ever more seldom."""
+    radio = Radio(loss=1.0, seed=1)
+    number = radio.ends[0].send(b"hello", 0.0)
+    while radio.ends[0].going(number):
+        radio.step()
+    assert radio.ends[0].failed == {number: "nothing was heard for 60 s"}
+    assert radio.frames < 25
+
+
+def test_what_is_not_sent() -> None:
+    """Too long a message, and one too many, are refused before anything is sent."""
+    end = Channel(itertools.count().__next__)
+    with pytest.raises(NotDelivered, match="at most"):
+        end.send(bytes(MAX_BYTES + 1), 0.0)
+    for _ in range(MAX_GOING):
+        end.send(b"", 0.0)
+    with pytest.raises(NotDelivered, match="wait"):
+        end.send(b"", 0.0)
+
+
+def test_an_end_that_takes_less() -> None:
+    """A message that is too long for the other end fails with its reason, at once."""
+    radio = Radio(loss=0.0, seed=1)
+    small = Channel(itertools.count().__next__, max_bytes=500)
+    radio.ends = (radio.ends[0], small)
+    number = radio.ends[0].send(bytes(1000), 0.0)
+    for _ in range(20):
+        radio.step()
+    assert radio.ends[0].failed == {number: "at most 500 bytes are taken"}
+
+
+@given(st.lists(st.binary(max_size=200) | st.binary(max_size=120).map(lambda data: b"SB\x01\x01" + data), max_size=40))
+def test_no_payload_does_harm(payloads: list[bytes]) -> None:
+    """Whatever comes, nothing is raised, memory is bounded, and a real message still gets through."""
+    radio = Radio(loss=0.0, seed=3)
+    for payload in payloads:
+        radio.ends[1].take(payload, 0.0)
+    number = radio.ends[0].send(b"still here", 0.0)
+    for _ in range(20):
+        radio.step()
+    assert not radio.ends[0].going(number)
+    assert b"still here" in radio.got[1]
+
+
+def test_a_changed_message_is_not_taken() -> None:
+    """Parts that do not make the announced checksum are refused, and the sender is told."""
+    radio = Radio(loss=0.0, seed=4)
+    number = radio.ends[0].send(bytes(150), 0.0)
+    first, second = radio.ends[0].due(0.0)
+    radio.ends[1].take(first[:-1] + b"x", 0.0)
+    assert radio.ends[1].take(second, 0.0) is None
+    for payload in radio.ends[1].due(1.0):
+        radio.ends[0].take(payload, 1.0)
+    assert radio.ends[0].failed == {number: "its checksum is wrong"}
