@@ -239,8 +239,10 @@ class Books:
         """Hand what is ready, or a start that there is room for, to those who wait, first come first served."""
         if not self._waiting:
             return
+        # Handing out only takes: what could not be had for one need cannot be had for another like it just after.
+        in_vain: set[Need] = set()
         for waiter in tuple(self._waiting):
-            if waiter.got.done():
+            if waiter.got.done() or waiter.need in in_vain:
                 continue
             container = self._ready_for(waiter.need)
             if container is not None:
@@ -251,5 +253,7 @@ class Books:
                 except SwiftbotError as error:
                     waiter.got.set_exception(error)
                     continue
-            if container is not None:
+            if container is None:
+                in_vain.add(waiter.need)
+            else:
                 waiter.got.set_result(container)

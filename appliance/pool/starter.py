@@ -80,6 +80,8 @@ class Starter:
         self._catalogue = catalogue
         self._site = site
         self._proven: set[str] = set()
+        self._sizes: dict[str, Size] = {}
+        self._preloads_mb: dict[str, int] = {}
         self._on_death = on_death
         self._labels = {LABEL_FLEET: fleet, LABEL_GATEWAY: gateway}
         self._code = code_digest(catalogue) + hashlib.sha256(json.dumps(site, sort_keys=True).encode()).hexdigest()
@@ -91,16 +93,30 @@ class Starter:
 
     def size(self, image: str, need: Need | None = None) -> Size:
         """Return what a container of an image gets: enough for each of its skills, and for `need`."""
-        own = [each for each in self._catalogue.skills.values() if each.image == image]
-        cpus = [self._config.cpu, *(each.cpu for each in own), *([need.cpu] if need else [])]
-        memories = [
-            self._config.container_memory_mb,
-            *(each.memory_mb for each in own),
-            *([need.memory_mb] if need else []),
-        ]
-        memories = [each + sum(skill.preload_mb for skill in self.skills(image)) for each in memories]
-        volumes = {name for each in own for name in each.volumes} | set(need.volumes if need else ())
-        return Size(cpu=max(cpus), memory_mb=max(memories), volumes=tuple(sorted(volumes)))
+        least = self._least(image)
+        if need is None:
+            return least
+        memory_mb = max(least.memory_mb, need.memory_mb + self._preload_mb(image))
+        volumes = least.volumes if not need.volumes else tuple(sorted({*least.volumes, *need.volumes}))
+        return Size(cpu=max(least.cpu, need.cpu), memory_mb=memory_mb, volumes=volumes)
+
+    def _least(self, image: str) -> Size:
+        """Return what each container of an image gets; asked for each run that waits, so it is worked out once."""
+        if image not in self._sizes:
+            own = [each for each in self._catalogue.skills.values() if each.image == image]
+            memory_mb = max(self._config.container_memory_mb, *(each.memory_mb for each in own), 0)
+            volumes = {name for each in own for name in each.volumes}
+            self._sizes[image] = Size(
+                cpu=max(self._config.cpu, *(each.cpu for each in own), 0.0),
+                memory_mb=memory_mb + self._preload_mb(image),
+                volumes=tuple(sorted(volumes)),
+            )
+        return self._sizes[image]
+
+    def _preload_mb(self, image: str) -> int:
+        if image not in self._preloads_mb:
+            self._preloads_mb[image] = sum(skill.preload_mb for skill in self.skills(image))
+        return self._preloads_mb[image]
 
     def new(self, image: str, need: Need | None = None) -> PooledContainer:
         """Return a container that is yet to be started."""
