@@ -19,7 +19,7 @@ import structlog
 
 from appliance import logs, service
 from appliance.config import GatewayConfig
-from appliance.errors import ConfigError, RefusedError, SwiftbotError
+from appliance.errors import ConfigError, PrerequisiteError, RefusedError, SwiftbotError
 from appliance.llm.cascade import Decomposer
 from appliance.model import (
     ContainerInfo,
@@ -36,6 +36,10 @@ from appliance.model import (
 from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.pool import Call, Pool
+from appliance.pool.state import ALONE, State
+from appliance.pool.storage import PodmanStorage
+from appliance.pool.transfer.transfers import Transfers
+from appliance.pool.volumes import Volumes
 from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
@@ -45,7 +49,7 @@ from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
-from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
+from appliance.tasks.remote import Links, RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
 
 log = structlog.get_logger(__name__)
@@ -71,6 +75,8 @@ class Gateway:
         self._ready = asyncio.Event()
         """Tasks can be handed in."""
         self._handing_in: set[asyncio.Task[None]] = set()
+        self._volumes: Volumes | None = None
+        self._transfers: Transfers | None = None
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -109,7 +115,8 @@ class Gateway:
             self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
         )
         calls = Calls(self.plane, artifacts, on_wait=self._on_wait)
-        remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=UnmeasuredLinks())
+        state, links = await self._open_state()
+        remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=links)
 
         async def on_call(call: Call) -> dict[str, object]:
             return await calls(call)
@@ -125,6 +132,7 @@ class Gateway:
             facts=remote.facts,
             on_call=on_call,
             on_change=self._on_containers,
+            state=state,
         )
         self.executor = Executor(self.plane, self.pool, remote, config.tasks)
         self.executor.on_change = self._changed.set
@@ -161,6 +169,48 @@ class Gateway:
         for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
             self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
+
+    async def _open_state(self) -> tuple[State, Links]:
+        """Open the ledger of state volumes and the transfers of them and of images; neither without Podman."""
+        config = self.config
+        try:
+            storage = PodmanStorage(config.pool.podman_url)
+        except PrerequisiteError as error:
+            log.warning("state volumes and images cannot be moved", reason=str(error))
+            return ALONE, UnmeasuredLinks()
+
+        async def let_go() -> None:
+            await asyncio.to_thread(storage.close)
+
+        self._stack.push_async_callback(let_go)
+        plane, settings = self.plane, config.pool.transfer
+        self._volumes = volumes = Volumes(
+            settings, fleet=config.fleet, gateway=config.id, store=plane.store, records=plane.dht, storage=storage
+        )
+        await volumes.start()
+        self._stack.push_async_callback(volumes.close)
+        volumes.on_change = self._changed.set
+        plane.registry.on_change.append(self._hear_of_volumes)
+        plane.on_member_lost.append(lambda gateway: volumes.hear(gateway, ()))
+        self._transfers = transfers = Transfers(
+            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data
+        )
+        await transfers.start()
+        self._stack.push_async_callback(transfers.close)
+        transfers.on_change = self._changed.set
+        state = State(
+            bring=transfers.bring_newest,
+            use=volumes.use,
+            newest_here=volumes.newest_here,
+            bring_image=transfers.bring_image,
+        )
+        return state, transfers
+
+    def _hear_of_volumes(self, what: str) -> None:
+        if what == "gateway" and self._volumes is not None:
+            for gateway, status in self.plane.registry.gateways.items():
+                if gateway != self.config.id:
+                    self._volumes.hear(gateway, status.volumes)
 
     def _load(self) -> tuple[Catalogue, Site]:
         catalogue = load_catalogue(tuple(Path(each).expanduser() for each in self.config.skills))
@@ -261,7 +311,10 @@ class Gateway:
         containers = self.pool.containers()
         capacity = self.config.pool.capacity
         cpu = psutil.cpu_percent(interval=None)
-        counters = Counter(self.plane.session.refused) + Counter(self.hub.refused) + Counter(self.pool.refused)
+        moving = [each.refused for each in (self._volumes, self._transfers) if each is not None]
+        counters = Counter[str]()
+        for each in (self.plane.session.refused, self.hub.refused, self.pool.refused, *moving):
+            counters.update(each)
         return GatewayStatus(
             id=self.config.id,
             fleet=self.config.fleet,
@@ -278,6 +331,8 @@ class Gateway:
             draining=self._draining,
             limits_enforced=self.pool.limits_enforced,
             pool_problem=self.pool.problem or self.pool.squeeze,
+            images=self._transfers.images() if self._transfers is not None else (),
+            volumes=self._volumes.infos() if self._volumes is not None else (),
             robots=self.hub.attached,
             endpoints=self.config.plane.listen,
             refused=dict(counters),
