@@ -72,7 +72,7 @@ def stems(text: str) -> frozenset[str]:
     """Return the words of a text without endings of the plural, number words also in figures."""
     words = re.findall(r"[a-z0-9]+", re.sub(r"['’]s\b", "", text.lower()))
     found = {stem(word) for word in words} | {NUMBERS[word] for word in words if word in NUMBERS}
-    for first, second in zip(words, [*words[1:], ""], strict=True):
+    for first, second in zip(words, (*words, "")[1:], strict=True):
         found.add(stem(first + second))
         if first in _TENS:
             found.add(str(_TENS[first] * 10 + (int(NUMBERS.get(second, "0")) % 10)))
