@@ -7,7 +7,7 @@ for the next try. Decisions are in `flow`; here they are carried out.
 import asyncio
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -66,8 +66,16 @@ class Fetcher:
     """Fetches for one gateway; keeps what it learns of the links to others."""
 
     def __init__(
-        self, config: TransferConfig, *, plane: Plane, spool: Spool, offers: Offers, refused: Counter[str]
+        self,
+        config: TransferConfig,
+        *,
+        plane: Plane,
+        spool: Spool,
+        offers: Offers,
+        refused: Counter[str],
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
+        self._sleep = sleep
         self.links: dict[str, Link] = {}
         self._config, self._plane, self._spool, self._offers, self._refused = config, plane, spool, offers, refused
         self._threads = ThreadPoolExecutor(max_workers=2, thread_name_prefix="fetching")
@@ -100,6 +108,7 @@ class Fetcher:
             RefusedError: there is no room here, or none of them gives it now.
         """
         left = deque(dict.fromkeys(sources))
+        before, seen = job.done_bytes, set[str]()
         job.last_chunk = time.monotonic()
         problem: SwiftbotError = NotFoundError(
             f"no gateway that answers has {kind} {name[:80]}", remedy="swiftbot fleet shows who is there"
@@ -120,6 +129,11 @@ class Fetcher:
             arrival = await self._thread(lambda manifest=manifest: self._spool.open(manifest))
             try:
                 await self._seed(arrival)
+                if manifest.digest not in seen:
+                    job.resumed_bytes += arrival.bytes_there
+                    seen.add(manifest.digest)
+                job.size_bytes = before + manifest.size_bytes
+                job.done_bytes = before + arrival.bytes_there
                 await self._chunks(source, arrival, job)
             except _LeaveError as leave:
                 await self._thread(lambda arrival=arrival: self._spool.close(arrival))
@@ -146,7 +160,7 @@ class Fetcher:
         """Pause before the next source; give up when nothing came for long."""
         if time.monotonic() - job.last_chunk > self._config.patience_s:
             raise error
-        await asyncio.sleep(_AGAIN_S)
+        await self._sleep(_AGAIN_S)
 
     async def _manifest(
         self, source: str, kind: str, name: str, job: Job, accept: Callable[[Manifest], str]
@@ -168,7 +182,7 @@ class Fetcher:
                 raise DeadlineError(f"{source} did not make {kind} {name[:80]} ready in time")
             job.state = "preparing"
             job.last_chunk = time.monotonic()
-            await asyncio.sleep(_AGAIN_S)
+            await self._sleep(_AGAIN_S)
 
     async def _seed(self, arrival: Arrival) -> None:
         """What our own last state has in common with what arrives need not come."""
@@ -186,10 +200,7 @@ class Fetcher:
             most=config.window, in_flight_s=config.in_flight_s, chunk_bytes=manifest.chunk_bytes, bytes_per_s=known
         )
         zstd = known is None or known < _WORTH_ZSTD_BYTES_PER_S
-        there = arrival.bytes_there
         job.state = "moving"
-        job.size_bytes, job.done_bytes = max(job.size_bytes, manifest.size_bytes), there
-        job.resumed_bytes += there
         began, content = time.monotonic(), 0
         pending = deque(arrival.missing)
         running: dict[asyncio.Task[int | SwiftbotError], int] = {}
@@ -225,7 +236,7 @@ class Fetcher:
                     step = after_failure(outcome, in_a_row=in_a_row, bad=bad)
                     if step.next is not Next.AGAIN:
                         raise _LeaveError(step.next, outcome)
-                    await asyncio.sleep(step.wait_s)
+                    await self._sleep(step.wait_s)
         finally:
             for task in running:
                 task.cancel()
