@@ -44,7 +44,7 @@ def reply(
             body = ErrorReply(code=error.code, message=error.message, remedy=error.remedy, problems=problems)
             query.reply_err(encode(body), encoding="application/json")
         elif bulk:
-            query.reply(key, answer, encoding="application/octet-stream", priority=zenoh.Priority.DATA_LOW)
+            query.reply(key, answer, encoding="application/octet-stream")
         else:
             query.reply(key, answer, encoding="application/json", express=True)
 

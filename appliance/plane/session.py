@@ -188,7 +188,7 @@ class Session:
     def serve(self, expr: str, handler: Callable[[str, bytes], Awaitable[bytes]], *, bulk: bool = False) -> Closer:
         """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
 
-        `bulk`: answers are raw bytes, of low priority, and wait in a queue of their own.
+        `bulk`: answers are raw bytes and wait in a queue of their own; their priority is that of the question.
 
         A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
         and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
@@ -258,8 +258,8 @@ class Session:
         self.refuse(what, key=str(query.key_expr), reason=str(error))
         self._send(expr, partial(link.reply, query, expr, None, error), 0)
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """Ask whoever serves a key and return the first answer.
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False) -> bytes:
+        """Ask whoever serves a key and return the first answer; `bulk`: other messages go before it.
 
         Raises:
             UnreachableError: nobody serves the key, or whoever did went away before answering.
@@ -284,7 +284,8 @@ class Session:
                 )
 
         try:
-            self._get(key, payload, timeout_s, on_reply, on_end, target=zenoh.QueryTarget.BEST_MATCHING)
+            target = zenoh.QueryTarget.BEST_MATCHING
+            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk)
             async with asyncio.timeout(timeout_s):
                 return await answer
         except TimeoutError:
@@ -319,6 +320,7 @@ class Session:
         on_end: Callable[[], None],
         *,
         target: zenoh.QueryTarget,
+        bulk: bool = False,
     ) -> None:
         limit = self.config.max_payload_bytes
         if len(payload) > limit:
@@ -348,6 +350,7 @@ class Session:
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
             timeout=timeout_s + 1.0,
             congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA,
             express=True,
             payload=payload,
         )

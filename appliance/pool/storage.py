@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
+import requests
 from msgspec import Struct
 
 from appliance.errors import NotFoundError, PoolError, PrerequisiteError
@@ -49,7 +50,7 @@ class PodmanStorage(PodmanEngine):
 
         def work(client: Any) -> FoundVolume:
             response = client.api.get(f"/volumes/{name}/json")
-            if response.status_code == 404:
+            if response.status_code == requests.codes.not_found:
                 raise NotFoundError(f"there is no volume {name}")
             response.raise_for_status()
             found = response.json()
@@ -64,7 +65,7 @@ class PodmanStorage(PodmanEngine):
 
         def work(client: Any) -> None:
             response = client.api.delete(f"/volumes/{name}")
-            if response.status_code != 404:
+            if response.status_code != requests.codes.not_found:
                 response.raise_for_status()
 
         await self._ask(f"remove volume {name}", work)
@@ -110,8 +111,8 @@ class PodmanStorage(PodmanEngine):
 
         def work(client: Any) -> None:
             response = client.api.get(f"/images/{image_id}/get", params={"format": "docker-archive"}, stream=True)
-            with response:
-                if response.status_code == 404:
+            try:
+                if response.status_code == requests.codes.not_found:
                     raise NotFoundError(f"there is no image {image_id[:12]}")
                 response.raise_for_status()
                 with tarfile.open(fileobj=cast("BinaryIO", response.raw), mode="r|") as tar:
@@ -121,6 +122,8 @@ class PodmanStorage(PodmanEngine):
                             body = tar.extractfile(member)
                             if body is not None:
                                 take(stem, cast("BinaryIO", body))
+            finally:
+                response.close()
 
         try:
             await self._ask(f"export image {image_id[:12]}", work)
@@ -143,7 +146,7 @@ class PodmanStorage(PodmanEngine):
 
         def work(client: Any) -> None:
             response = client.api.delete(f"/images/{reference}", params={"force": "false"})
-            if response.status_code != 404:
+            if response.status_code != requests.codes.not_found:
                 response.raise_for_status()
 
         await self._ask(f"remove image {reference}", work)
@@ -159,7 +162,7 @@ class PodmanStorage(PodmanEngine):
 
 def _facts(client: Any, reference: str) -> ImageFacts:
     response = client.api.get(f"/images/{reference}/json")
-    if response.status_code == 404:
+    if response.status_code == requests.codes.not_found:
         raise NotFoundError(f"there is no image {reference}", remedy="swiftbot images list")
     response.raise_for_status()
     found = cast("dict[str, Any]", response.json())

@@ -21,7 +21,7 @@ import msgspec
 import structlog
 from msgspec import Struct
 
-from appliance.errors import ConflictError, NotFoundError, PayloadError, RefusedError, SwiftbotError
+from appliance.errors import ConflictError, NotFoundError, PayloadError, PoolError, RefusedError, SwiftbotError
 from appliance.model import VersionVector, VolumeInfo
 from appliance.plane.keys import check_name
 from appliance.plane.store import Store
@@ -474,18 +474,27 @@ class Volumes:
             except SwiftbotError:
                 place.forget()
                 raise
-            place.finish(journal)
             return journal
 
         try:
             journal = await _whole(work)
         except SwiftbotError as error:
             self._refuse("volume not unpacked", volume=name, reason=str(error))
+            if keep:  # nothing was begun, so nothing is in it
+                with contextlib.suppress(SwiftbotError):
+                    await self._storage.remove_volume(keep)
             raise
-        await self._finished(name, place, journal)
+        await self._finish(name, place, journal)
 
-    async def _finished(self, name: str, place: Place, journal: Journal) -> None:
-        """After the renames: the old state to where it is kept, the new one into the ledger."""
+    async def _finish(self, name: str, place: Place, journal: Journal) -> None:
+        """Do a swap that is decided; what fails is gone on with when the volume is next looked at."""
+        try:
+            await _whole(functools.partial(place.finish, journal))
+        except OSError as error:
+            raise PoolError(
+                f"volume {name} could not be swapped to the end: {error}", remedy=f"look at {place.work}"
+            ) from error
+        # The old state to where it is kept, the new one into the ledger.
         if journal.keep:
             await self._storage.ensure_volume(journal.keep, {**self._labels, LABEL_KEPT: name})
             kept = await self._storage.volume(journal.keep)
@@ -510,8 +519,7 @@ class Volumes:
         journal = await asyncio.to_thread(place.journal)
         if journal is not None:
             log.info("a volume's swap is gone on with", volume=name)
-            await _whole(functools.partial(place.finish, journal))
-            await self._finished(name, place, journal)
+            await self._finish(name, place, journal)
         return volume.folder
 
     async def _make(self, name: str) -> Path:

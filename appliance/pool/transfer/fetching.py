@@ -54,11 +54,11 @@ class Job:
         self.last_chunk = time.monotonic()
 
 
-class _LeaveError(SwiftbotError):
+class _Leave(Exception):  # noqa: N818 - not an error of its own: what follows from one
     """This gateway is not asked any more, or has to be asked anew; `cause` says why."""
 
     def __init__(self, step: Next, cause: SwiftbotError) -> None:
-        super().__init__(cause.message, remedy=cause.remedy)
+        super().__init__(str(cause))
         self.step, self.cause = step, cause
 
 
@@ -135,7 +135,7 @@ class Fetcher:
                 job.size_bytes = before + manifest.size_bytes
                 job.done_bytes = before + arrival.bytes_there
                 await self._chunks(source, arrival, job)
-            except _LeaveError as leave:
+            except _Leave as leave:
                 await self._thread(lambda arrival=arrival: self._spool.close(arrival))
                 problem = leave.cause
                 if leave.step is Next.OTHER and isinstance(leave.cause, PayloadError):
@@ -235,7 +235,7 @@ class Fetcher:
                         window.lost()
                     step = after_failure(outcome, in_a_row=in_a_row, bad=bad)
                     if step.next is not Next.AGAIN:
-                        raise _LeaveError(step.next, outcome)
+                        raise _Leave(step.next, outcome)
                     await self._sleep(step.wait_s)
         finally:
             for task in running:
@@ -254,7 +254,7 @@ class Fetcher:
         """
         key = self._plane.keys.chunk(source, arrival.manifest.digest, index)
         try:
-            answer = await self._plane.session.query(key, ZSTD if zstd else b"", timeout_s=timeout_s)
+            answer = await self._plane.session.query(key, ZSTD if zstd else b"", timeout_s=timeout_s, bulk=True)
         except SwiftbotError as error:
             return error
         length = arrival.manifest.span(index)[1]

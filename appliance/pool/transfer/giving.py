@@ -119,10 +119,13 @@ class Giver:
         """Return what is made ready, by one job however many ask; None when it takes longer."""
         job = self._jobs.get(what)
         if job is None:
+            # What nobody came back for is kept among the offers all the same.
+            self._jobs = {name: each for name, each in self._jobs.items() if not each.done()}
             if len(self._jobs) >= _JOBS:
                 self._refused["transfer busy"] += 1
                 raise RefusedError(f"{_JOBS} things are being made ready", remedy="ask again in a moment")
             job = self._jobs[what] = asyncio.create_task(self._made(make), name=f"make {what} ready")
+            job.add_done_callback(_seen)
         done, _ = await asyncio.wait([job], timeout=ANSWER_S)
         if not done:
             return None
@@ -206,6 +209,7 @@ class Giver:
             draft.unlink(missing_ok=True)
 
 
-def is_ours(reference: str) -> bool:
-    """Whether an image is one that gateways give each other."""
-    return reference.startswith(REFERENCE_PREFIX) and not reference.endswith(":<none>")
+def _seen(job: asyncio.Task[object]) -> None:
+    """A job that failed when nobody waited any more is no fault of the event loop's."""
+    if not job.cancelled() and job.exception() is not None:
+        log.info("not made ready", job=job.get_name(), reason=str(job.exception()))

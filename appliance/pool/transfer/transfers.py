@@ -169,6 +169,8 @@ class Transfers:
                 raise RefusedError(f"{len(self._tasks)} transfers are under way or wait", remedy="try again later")
             job = self._jobs[what] = Job(secrets.token_hex(4), what)
             task = self._tasks[what] = asyncio.create_task(self._run(job, bring), name=f"bring {what}")
+            # Said in the log already, also when nobody waits for it any more.
+            task.add_done_callback(lambda done: done.cancelled() or done.exception())
         try:
             return await asyncio.shield(task)
         except asyncio.CancelledError:

@@ -103,8 +103,9 @@ class FakePlane:
             raise UnreachableError("dead")
         return ManifestOffer(manifest=peer.manifest)
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, bulk: bool) -> bytes:
         """Ask for a chunk."""
+        assert bulk
         assert timeout_s > 0
         await asyncio.sleep(0)
         _, _, _, gateway, _, digest, index = key.split("/")
