@@ -1,4 +1,4 @@
-"""What signed links know, kept in the gateway's store: after a restart nothing old is believed and no time used twice."""
+"""What signed links know, kept in the store: after a restart nothing old is believed and no time used twice."""
 
 import asyncio
 from collections.abc import Sequence

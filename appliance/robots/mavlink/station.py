@@ -297,6 +297,7 @@ class Station:
 
         async def serve() -> None:
             await ledger.load()
+            desk.verbs = copter.verbs()  # its heartbeat has told by now what it is: it can be commanded at once
             each.queryable = self._session.serve(self._session.keys.command(name), desk.handle)
             self._see(each, asyncio.get_running_loop().time())
             log.info("vehicle attached", robot=name, address=address)
