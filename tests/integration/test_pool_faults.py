@@ -215,7 +215,7 @@ async def _next_run_works(bench: Bench, pool: Pool) -> RunEvent:
         ("class", "skill", "object cannot be sent"),
         ("list", "skill", "returned list, not a dict"),
         ("nan", "skill", "Out of range float"),
-        ("large checkpoint", "payload", "1048576 allowed"),
+        ("large checkpoint", "payload", "262144 allowed"),
         ("close", "crashed", "no result"),
         ("garbage", "payload", "garbage"),
         ("endless frame", "payload", "cut off within a message"),

@@ -14,7 +14,9 @@ from .link import CallError, Cancelled, Fail, Frame, Link
 from .spec import Skill, Spec
 
 MAX_NEWS = 2**20
-"""Longest partial result and checkpoint in bytes of JSON: both are written into the task's record."""
+"""Longest partial result in bytes of JSON: it is news for whoever listens."""
+MAX_CHECKPOINT = 2**18
+"""Longest checkpoint in bytes of JSON: it is kept on several gateways and travels with the next attempt's order."""
 
 
 class Surroundings:
@@ -115,20 +117,20 @@ class Context(Surroundings):
 
     def partial(self, result: dict[str, Any]) -> None:
         """Publish what is known so far of the result; CallError when it is longer than 1 MiB of JSON."""
-        self._tell("partial", "result", result)
+        self._tell("partial", "result", result, MAX_NEWS)
 
     def checkpoint(self, data: dict[str, Any]) -> None:
-        """Keep data from which a later attempt could go on (`ctx.resume`); CallError beyond 1 MiB of JSON."""
-        self._tell("checkpoint", "data", data)
+        """Keep data from which a later attempt could go on (`ctx.resume`); CallError beyond 256 KiB of JSON."""
+        self._tell("checkpoint", "data", data, MAX_CHECKPOINT)
 
-    def _tell(self, kind: str, key: str, value: dict[str, Any]) -> None:
+    def _tell(self, kind: str, key: str, value: dict[str, Any], most: int) -> None:
         if not isinstance(value, dict):  # pyright: ignore[reportUnnecessaryIsInstance] - handlers are not checked
             raise CallError("payload", f"a {kind} is a dict, not {type(value).__name__}")
         data = encode({"ev": kind, key: value})
-        if len(data) > MAX_NEWS:
+        if len(data) > most:
             raise CallError(
                 "payload",
-                f"{kind} of {len(data)} bytes, {MAX_NEWS} allowed",
+                f"{kind} of {len(data)} bytes, {most} allowed",
                 "put large things with ctx.put_artifact and keep the reference",
             )
         self._link.send_encoded(data)
