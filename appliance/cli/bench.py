@@ -39,6 +39,21 @@ def measure(work: Coroutine[Any, Any, T]) -> T:
         raise KeyboardInterrupt from None
 
 
+def say(text: str) -> None:
+    """Show how far a measurement is; as plain text, whatever is in it."""
+    console.err.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def tell(result: dict[str, Any], *, as_json: bool) -> None:
+    """Print a result as JSON, or as Markdown tables."""
+    from appliance.bench.tables import markdown
+
+    if as_json:
+        show(result, as_json=True)
+    else:
+        console.out.print(markdown(result), markup=False, highlight=False, soft_wrap=True, end="")
+
+
 @bench_app.command
 def startup(*, count: int = 100, cold: int = 5, image: str = "base", ray: bool = True, as_json: Json = False) -> int:
     """Subtask startup: cold containers, warm local ones, warm ones of other gateways, Ray's actors, in one run.
@@ -51,8 +66,7 @@ def startup(*, count: int = 100, cold: int = 5, image: str = "base", ray: bool =
     """
     from appliance.bench.federated import run_all
 
-    result = measure(run_all(count, cold, image=image, ray=ray, progress=console.err.print))
-    show(result, as_json=as_json, table=console.bench_table(result))
+    tell(measure(run_all(count, cold, image=image, ray=ray, progress=say)), as_json=as_json)
     return 0
 
 
@@ -87,8 +101,7 @@ def rate(
         modes=mode, spreads=spread, rates=rates, services_ms=service_ms, seconds=seconds, limit_ms=limit_ms,
         seed=seed, image=image,
     )  # fmt: skip
-    result = measure(run(options, progress=console.err.print))
-    show(result, as_json=as_json, table=console.bench_table(result))
+    tell(measure(run(options, progress=say)), as_json=as_json)
     return 0
 
 
@@ -109,8 +122,7 @@ def refill(
     """
     from appliance.bench.refill import run
 
-    result = measure(run(containers, at_once, image=image, progress=console.err.print))
-    show(result, as_json=as_json, table=console.bench_table(result))
+    tell(measure(run(containers, at_once, image=image, progress=say)), as_json=as_json)
     return 0
 
 
@@ -128,8 +140,8 @@ def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: in
     """
     from appliance.bench.soak import run
 
-    result = measure(run(count, at_once=at_once, image=image, seed=seed, progress=console.err.print))
-    show(result, as_json=as_json, table=console.bench_table({**result, "checkpoints": len(result["checkpoints"])}))
+    result = measure(run(count, at_once=at_once, image=image, seed=seed, progress=say))
+    tell(result, as_json=as_json)
     return 0 if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else 1
 
 
@@ -142,7 +154,6 @@ def bench_table(file: Path, /) -> int:
     """
     import msgspec
 
-    from appliance.bench.tables import markdown
     from appliance.errors import NotFoundError, PayloadError
 
     try:
@@ -153,7 +164,7 @@ def bench_table(file: Path, /) -> int:
         raise PayloadError(
             f"{file} is no result: {error}", remedy="name a file of `swiftbot bench … --json`"
         ) from error
-    console.out.print(markdown(found), markup=False, highlight=False, soft_wrap=True, end="")
+    tell(found, as_json=False)
     return 0
 
 
