@@ -56,6 +56,8 @@ class Sampled(Struct, frozen=True, kw_only=True):
     """The most runs seen waiting for a container, by gateway."""
     containers: dict[str, int] = {}
     """Containers held at the end, by gateway."""
+    refused: dict[str, int] = {}
+    """What gateways have counted as refused meanwhile, by kind: full queues, offers that had gone, ..."""
 
 
 def arrivals(rate: float, seconds: float, gateways: Sequence[str], *, spread: Spread, seed: int) -> tuple[Arrival, ...]:
@@ -97,6 +99,7 @@ def account(outcomes: Sequence[Outcome], seen: Sampled) -> dict[str, Any]:
         "cores_by_process": {name: round(cores, 2) for name, cores in seen.daemons.items()},
         "queue": {name: length for name, length in seen.queue.items() if length},
         "containers": seen.containers,
+        "counted": seen.refused,
     }
 
 
@@ -130,6 +133,8 @@ def _causes(outcomes: Sequence[Outcome], seen: Sampled) -> list[str]:
     if waiting := sorted(((length, name) for name, length in seen.queue.items() if length), reverse=True):
         lengths = ", ".join(f"{length} at {name}" for length, name in waiting)
         found.append(f"queue: up to {lengths} waited for a container")
+    if gone := seen.refused.get("stale offer", 0):
+        found.append(f"offers: {gone} containers of other gateways were gone when asked for")
     cold = sum(each.phase == "cold" for each in outcomes)
     if cold:
         found.append(f"cold starts: {cold} of {len(outcomes)}")

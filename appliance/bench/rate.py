@@ -13,6 +13,7 @@ first one that is too much ends the ladder. All of it shares the machine with th
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -180,6 +181,7 @@ class Watch:
         self._processes["sender"] = psutil.Process()
         self._queue: dict[str, int] = {}
         self._began, self._busy_s, self._used_s = time.monotonic(), busy_s(), self._used()
+        self._refused = self._counters()
         self.seen = Sampled()
 
     async def sample(self) -> None:
@@ -202,8 +204,15 @@ class Watch:
             cpu=min(1.0, busy / wall_s / (psutil.cpu_count() or 1)),
             daemons=cores,
             queue=self._queue,
+            refused=dict(self._counters() - self._refused),
             containers={name: status.containers for name, status in sorted(gateways.items())},
         )
+
+    def _counters(self) -> Counter[str]:
+        total: Counter[str] = Counter()
+        for status in self._orders.client.plane.registry.gateways.values():
+            total.update(status.refused)
+        return total
 
     def _used(self) -> dict[str, float]:
         found: dict[str, float] = {}
