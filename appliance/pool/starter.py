@@ -105,7 +105,8 @@ class Starter:
         if image not in self._sizes:
             own = [each for each in self._catalogue.skills.values() if each.image == image]
             memory_mb = max(self._config.container_memory_mb, *(each.memory_mb for each in own), 0)
-            volumes = {name for each in own for name in each.volumes}
+            # Those of compatible images' skills too: one that runs without its volume would lose what it writes.
+            volumes = {name for each in self.skills(image) for name in each.volumes}
             self._sizes[image] = Size(
                 cpu=max(self._config.cpu, *(each.cpu for each in own), 0.0),
                 memory_mb=memory_mb + self._preload_mb(image),

@@ -21,8 +21,13 @@ from appliance.config import GatewayConfig
 from appliance.local_fleet import FleetState, Order
 from appliance.model import (
     ContainerState,
+    Need,
     Phase,
     Plan,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
     Subtask,
     SubtaskState,
     TaskRecord,
@@ -44,6 +49,7 @@ domain = "coordination"
 summary = "A test's own skill."
 runs = "compute"
 image = "base"
+volumes = {volumes}
 timeout_s = 120
 retries = 1
 """
@@ -63,15 +69,25 @@ QUICK = """
 def run(ctx):
     return {"attempt": ctx.attempt}
 """
+DIARY = """
+from pathlib import Path
+
+def run(ctx):
+    diary = Path("/volumes/diary/lines")
+    lines = diary.read_text().splitlines() if diary.exists() else []
+    diary.write_text("".join(line + chr(10) for line in [*lines, ctx.robot or "nobody"]))
+    return {"lines": len(lines) + 1}
+"""
 
 
 @pytest.fixture
 def skills(tmp_path: Path) -> Path:
-    """A folder with two skills of the tests' own: one that counts and saves how far it is, one that ends at once."""
-    for name, handler in (("count_up", COUNT), ("quick", QUICK)):
+    """A folder with skills of the tests' own: one counts and saves how far it is, one ends at once, one has state."""
+    for name, handler in (("count_up", COUNT), ("quick", QUICK), ("diary", DIARY)):
         folder = tmp_path / "skills" / name
         folder.mkdir(parents=True)
-        (folder / "skill.toml").write_text(MANIFEST.format(name=name))
+        volumes = '["diary"]' if name == "diary" else "[]"
+        (folder / "skill.toml").write_text(MANIFEST.format(name=name, volumes=volumes))
         (folder / "handler.py").write_text(handler)
     return tmp_path / "skills"
 
@@ -334,3 +350,51 @@ async def test_a_gateway_killed_with_its_warm_container_is_no_loss(up: Up) -> No
         ended = await end(client, accepted.id)
         assert ended.state is TaskState.SUCCEEDED, ended.failure
         assert ended.of("s1").gateway in ("gw-1", "gw-2")
+
+
+async def run_at(client: FleetClient, gateway: str, number: int, *, hops: int = 0) -> tuple[RunAccepted, RunEvent]:
+    """Order a run of the skill with state at one gateway; returns where it went and how it ended."""
+    heard: asyncio.Queue[RunEvent] = asyncio.Queue()
+    task = f"t-state-{number}"
+    client.on_run(task, heard)
+    await asyncio.sleep(0.3)
+    need = Need(image="base", volumes=("diary",))
+    request = RunRequest(task=task, subtask="s1", attempt=1, skill="diary", need=need, hops=hops)
+    accepted = await client.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=30.0)
+    async with asyncio.timeout(60):
+        while (event := await heard.get()).kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+            if event.kind is RunEventKind.STARTED:
+                print(f"{task} began on {event.gateway} after {event.startup_ms:.0f} ms")
+    return accepted, event
+
+
+async def newest(client: FleetClient, gateway: str, generation: int) -> None:
+    """Wait until both gateways have told where the newest state is."""
+    async with asyncio.timeout(30):
+        while not any(
+            each.generation >= generation
+            for each in client.plane.registry.gateways[gateway].volumes
+            if each.name == "diary"
+        ):
+            await asyncio.sleep(0.05)
+    await asyncio.sleep(0.5)  # the other gateway hears it as the client does
+
+
+async def test_a_subtask_never_runs_on_state_that_is_out_of_date(up: Up) -> None:
+    """Wherever it is ordered, it goes to the newest state or that is brought: each run finds what the last one left."""
+    fleet = await up(gateways=2, pool=PoolConfig(floor={"base": 1}))
+    async with FleetClient(fleet.endpoint) as client:
+        accepted, ended = await run_at(client, "gw-1", 1)
+        assert (accepted.gateway, ended.result) == ("gw-1", {"lines": 1}), ended.failure
+        await newest(client, "gw-1", 1)
+        # Passed on already, so it cannot go where the state is: the state must come.
+        accepted, ended = await run_at(client, "gw-2", 2, hops=1)
+        assert (ended.gateway, ended.result) == ("gw-2", {"lines": 2}), ended.failure
+        assert accepted.choice is not None
+        assert accepted.choice.way is Way.BRING_HERE
+        await newest(client, "gw-2", 2)
+        accepted, ended = await run_at(client, "gw-1", 3)
+        assert ended.result == {"lines": 3}, ended.failure
+        assert accepted.choice is not None
+        assert accepted.choice.way is (Way.RUN_THERE if ended.gateway == "gw-2" else Way.BRING_HERE)
+        assert {each.way for each in accepted.choice.considered} == {Way.RUN_THERE, Way.BRING_HERE}
