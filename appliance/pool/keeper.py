@@ -39,6 +39,8 @@ CONNECT_WAIT_S = 10.0
 """How long a start waits for Podman; after that it goes on without."""
 SWEEP_S = 30.0
 """How often Podman is asked whether it has containers of ours that are not in the books."""
+FIRST_SWEEP_S = 2.0
+"""The first time after Podman was reached: what a killed gateway had asked for may have come after the adoption."""
 
 
 class Keeper:
@@ -88,7 +90,7 @@ class Keeper:
             read=read_memory,
         )
         self._background: set[asyncio.Task[None]] = set()
-        self._next_sweep = 0.0
+        self._next_sweep = math.inf
         self.draining = False
         """Nothing new is begun here: no run, no hint, no warming."""
         self._adopted = False
@@ -450,7 +452,7 @@ class Keeper:
 
     async def _on_connected(self, engine: Engine, facts: EngineFacts) -> None:
         """Adopt what is there the first time; later look for what was left over."""
-        self._next_sweep = 0.0
+        self._next_sweep = time.monotonic() + FIRST_SWEEP_S
         if not self._adopted:
             for container in await self._starter.adopt(engine):
                 self.books.add(container)
