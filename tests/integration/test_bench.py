@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from appliance.bench import actors, federated, pooled, rate, refill, soak, startup
+from appliance.bench import actors, federated, pooled, rate, refill, soak, startup, zygote
 from appliance.pool.engine import PodmanEngine
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
@@ -152,3 +152,12 @@ async def test_soak(built: None) -> None:
     assert set(soak.SHARES) <= set(result["ended"])
     assert result["census"]["leaks"] == {}
     assert result["census"]["after"]["containers"] == result["census"]["after"]["conmon"] == soak.CONTAINERS
+
+
+async def test_zygote(built: None) -> None:
+    """Forks and starts are measured for a heap of each kind, beside a plain process that loads the same."""
+    result = await zygote.run(2, (4,), plain=1)
+    assert [(each["kind"], each["size_mb"]) for each in result["heaps"]] == [("objects", 4), ("buffers", 4)]
+    for each in result["heaps"]:
+        assert [each[key]["count"] for key in ("fork", "ahead", "at_once", "python")] == [2, 2, 2, 1]
+        assert each["rss_mb"] > 4

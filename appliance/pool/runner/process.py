@@ -27,6 +27,8 @@ class Run:
         self.kit = kit
         self.shared: mmap.mmap = kit.shared
         self.pid = 0
+        self.fork_ms = 0.0
+        """What the fork itself took, which grows with the zygote's memory."""
         self.timeout_s = 0.0
         self.deadline = 0.0
         self.kill_at: float | None = None
@@ -41,6 +43,7 @@ class Run:
         if order is None:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        began = time.monotonic()
         try:
             run.pid = os.fork()
             if run.pid == 0:
@@ -56,6 +59,7 @@ class Run:
             kit.shared.close()
             raise
         finally:
+            run.fork_ms = (time.monotonic() - began) * 1e3
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
             os.close(kit.pipe[1])
             if theirs is not None:

@@ -55,6 +55,7 @@ class Zygote:
         self._run: Run | None = None
         self._ahead: Run | None = None
         self._runs = 0
+        self._fork_ms = 0.0
         self._stopping = False
         self._epoll = select.epoll()
 
@@ -178,6 +179,7 @@ class Zygote:
             "ok": True,
             "run": self._run.id if self._run else "",
             "runs": self._runs,
+            "fork_ms": round(self._fork_ms, 3),
             "rss_mb": round(resident() / 2**20, 1),
             "problems": self._loaded.problems,
         }
@@ -234,6 +236,7 @@ class Zygote:
         if not self._stopping:
             with contextlib.suppress(OSError):  # no further process now: it is forked with its order
                 self._ahead = Run.fork(self._kit())
+                self._fork_ms = self._ahead.fork_ms
 
     def _watch(self) -> None:
         run = self._run

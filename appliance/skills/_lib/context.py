@@ -1,22 +1,39 @@
 """The shape of `ctx`, so that handlers are checked by type; the object itself comes from the runner."""
 
+import mmap
 from pathlib import Path
 from typing import Any, Protocol
 
 
-class Context(Protocol):
-    """What a handler's `run(ctx)` gets; docs/skills.md explains each member."""
+class Surroundings(Protocol):
+    """What a handler's `preload(ctx)` gets; docs/skills.md explains each member."""
+
+    site: dict[str, Any]
+    folder: Path
+
+    def volume(self, name: str) -> Path:
+        """Return the folder of a named volume; raises Fail when it is not mounted."""
+        ...
+
+    def map(self, path: str | Path) -> mmap.mmap:
+        """Return a file's bytes without reading them."""
+        ...
+
+    def Fail(self, message: str, remedy: str = "", retryable: bool = False) -> Exception:  # noqa: N802 - a class
+        """Make the exception that ends the run with that reason."""
+        ...
+
+
+class Context(Surroundings, Protocol):
+    """What a handler's `run(ctx)` gets."""
 
     params: dict[str, Any]
     robot: str | None
     inputs: dict[str, dict[str, Any]]
     attempt: int
-    site: dict[str, Any]
+    resume: dict[str, Any] | None
+    preloaded: Any
     scratch: Path
-
-    def Fail(self, message: str, remedy: str = "", retryable: bool = False) -> Exception:  # noqa: N802 - a class
-        """Make the exception that ends the run with that reason."""
-        ...
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
         """Have the robot do `verb`; files of the answer are bytes in `answer["blobs"][name]`."""
