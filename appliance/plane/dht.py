@@ -108,7 +108,7 @@ class Dht:
         """
         check_key(key)
         problem: SwiftbotError | None = None
-        for gateway in self._replicas(key):
+        for gateway in await self._membership.holders(key, self._config.replicas):
             try:
                 if gateway == self._gateway:
                     record = (await self._on_read(KeyAsk(key))).record
@@ -144,7 +144,7 @@ class Dht:
 
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
-        return self._membership.ring.owner(key) == self._gateway
+        return self._membership.owns(key)
 
     async def local(self, prefix: str) -> list[Record]:
         """Return this gateway's shard: the records it holds, as owner or replica, without those removed."""
@@ -157,8 +157,8 @@ class Dht:
         loop = asyncio.get_running_loop()
         until = loop.time() + self._config.write_timeout_s
         while True:
-            owner = self._membership.ring.owner(asked.key)
             try:
+                (owner,) = await self._membership.holders(asked.key, 1)
                 if owner == self._gateway:
                     return (await self._on_write(asked)).version
                 answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S)

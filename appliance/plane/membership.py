@@ -45,6 +45,24 @@ class Membership:
         """Ids of the gateways that are there; this one counts itself in."""
         return self._members
 
+    def sees(self, name: str) -> bool:
+        """Whether a gateway counts as there for its questions about records."""
+        return name in self._members
+
+    def owns(self, key: str) -> bool:
+        """Whether a key belongs to this gateway just now."""
+        return self.ring.owner(key) == self._gateway
+
+    async def holders(self, key: str, n: int) -> tuple[str, ...]:
+        """The first `n` gateways from the key's position on, its owner first; UnreachableError when there is none."""
+        return self.ring.successors(key, n)
+
+    async def enter(self) -> None:
+        """Find one's place among the members; nothing to do where all are known."""
+
+    async def leave(self) -> None:
+        """Tell the neighbours that one goes; nothing to do where all see the token go."""
+
     def start(self) -> None:
         """Begin to watch."""
         keys = self._session.keys
@@ -86,7 +104,10 @@ class Membership:
         self._members = self._members | {name} if alive else self._members - {name}
         self.ring = Ring(self._members, virtual_nodes=self._virtual_nodes)
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
-        for callback in tuple(self.on_joined if alive else self.on_lost):
+        self._tell(self.on_joined if alive else self.on_lost, name)
+
+    def _tell(self, listeners: list[Callable[[str], None]], name: str) -> None:
+        for callback in tuple(listeners):
             try:
                 callback(name)
             except Exception:  # supervision boundary: the other listeners must hear of it all the same

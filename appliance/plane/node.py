@@ -9,6 +9,7 @@ from pathlib import Path
 import structlog
 
 from appliance.errors import ConfigError, UnreachableError
+from appliance.plane.bounded import BoundedMembership
 from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
@@ -36,7 +37,7 @@ class Plane:
         self.store = store
         self.keys: Keys = session.keys
         self.rpc = Rpc(session, gateway)
-        self._membership = Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
+        self._membership = _membership(config, session, self.rpc, gateway)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
         self.dht = Dht(
@@ -93,6 +94,7 @@ class Plane:
         membership.start()
         self._pulse.start()
         self.registry.start()
+        await membership.enter()
         await self._reconciler.join()
         membership.join()
         self._reconciler.start()
@@ -129,6 +131,7 @@ class Plane:
 
     async def close(self) -> None:
         """Leave the fleet and close the store; more than once does no harm."""
+        await self._membership.leave()
         self._membership.close()
         await self._reconciler.close()
         await self.dht.close()
@@ -137,6 +140,12 @@ class Plane:
         await self.session.close()
         await self.store.close()
         self._pulse.close()
+
+
+def _membership(config: PlaneConfig, session: Session, rpc: Rpc, gateway: str) -> Membership:
+    if config.view == "full":
+        return Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
+    return BoundedMembership(session, rpc, gateway=gateway, bound=config.view, replicas=config.replicas)
 
 
 class PlaneClient:

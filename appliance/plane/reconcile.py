@@ -303,7 +303,7 @@ class Reconciler:
         """Wait until the asker is seen: from then on this gateway orders no writes of keys that the asker owns."""
         try:
             async with asyncio.timeout(_SEE_S), self._seen:
-                await self._seen.wait_for(lambda: asker in self._membership.members)
+                await self._seen.wait_for(lambda: self._membership.sees(asker))
         except TimeoutError:
             return False
         return True

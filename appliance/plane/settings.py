@@ -25,6 +25,10 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Copies of a record, the owner's among them: two gateways may die at once without losing one (design: r = 3)."""
     virtual_nodes: int = 32
     """Points of each gateway on the ring: shares within about 20 % of each other, and still cheap to compute."""
+    view: Literal["full"] | int = "full"
+    """`full`: every gateway knows every other, a lookup is one hop; right to about 1,000. A number: each knows so many
+    (4·log2 N is plenty), looks up hop by hop and has one point on the ring; the same in the whole fleet. Records work
+    so; placing of tasks and finding of containers still look among the gateways known."""
     find_successors: int = 5
     """How many successors of hash(image) are asked for containers (paper: k = 5)."""
     lease_ms: int = 1000
@@ -70,6 +74,11 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if self.mode == "client" and self.listen:
             raise ConfigError(
                 "plane.listen is set, but a client accepts no links", remedy="empty it, or set plane.mode to peer"
+            )
+        if self.view != "full" and self.view < max(16, 4 * self.replicas):
+            raise ConfigError(
+                f"plane.view is {self.view}",
+                remedy=f'"full", or at least {max(16, 4 * self.replicas)}: neighbours and fingers must fit in',
             )
         for name, least in _LEAST.items():
             if getattr(self, name) < least:

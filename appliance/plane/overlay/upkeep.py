@@ -18,6 +18,11 @@ _OTHERS = 4
 """Members named beside the neighbours whenever two meet: half of them the newest heard of, so that joins spread."""
 _GONE_S = 120.0
 """How long hearsay does not bring back a member that was found gone; it can itself, at once."""
+_LOST_S = 600.0
+"""How long a member that was found gone is tried again now and then: what was cut off may be linked again, and two
+parts of a ring that forgot each other would stay two rings."""
+_LOST_TURN = 16
+"""Every so many rounds."""
 _MOST_GONE = 1024
 _MOST_FIRST = 32
 _TRUST_S = 5.0
@@ -103,18 +108,21 @@ class Upkeep:
                 self.next_at = now + self._pace.least_s
                 return Meet(name)
         self.next_at = now + self.interval_s * self._rng.uniform(0.75, 1.25)
-        self._turn = (self._turn + 1) % 4
+        self._turn += 1
+        lost = self._lost(now) if self._turn % _LOST_TURN == 0 or not len(view) else ""
+        if lost:
+            return Meet(lost)
         if not len(view):
             return None
         after, before = view.after(), view.before()
         # Too short a list of neighbours: whoever is last in it knows those beyond.
-        if self._turn == 1:
+        if self._turn % 4 == 1:
             short = not view.whole and len(after) < view.after_count
             return Meet(after[-1] if short and after else view.names[0])
-        if self._turn == 3:
+        if self._turn % 4 == 3:
             short = not view.whole and len(before) < view.before_count
             return Meet(before[0] if short and before else view.names[-1])
-        targets = view.targets() if self._turn == 2 and not view.whole else []
+        targets = view.targets() if self._turn % 4 == 2 and not view.whole else []
         if targets:
             return Seek(self._rng.choice(targets))
         return Meet(min(view.names, key=lambda name: self._seen.get(name, 0.0)))
@@ -133,13 +141,13 @@ class Upkeep:
 
     def unreachable(self, member: str, now: float, *, in_round: bool = True) -> None:
         """A member is not there: found so in a round, by a lookup, or told by whoever watches for it."""
-        self.view.lose(member)
+        known = self.view.lose(member)
         self._seen.pop(member, None)
         if len(self._gone) >= _MOST_GONE:
             del self._gone[next(iter(self._gone))]
-        self._gone[member] = now
+        self._gone.setdefault(member, now)
         if in_round:
-            self._changed(True)
+            self._changed(known)
 
     def found(self, names: Iterable[str], now: float) -> None:
         """A lookup of a finger's position has ended with these members, or others were heard of."""
@@ -179,6 +187,11 @@ class Upkeep:
         newest = [name for name in self._newest if name in self.view][: _OTHERS // 2]
         drawn = self._rng.sample(names, min(len(names), _OTHERS - len(newest)))
         return tuple(name for name in dict.fromkeys((*newest, *drawn)) if name != ask.asker)
+
+    def _lost(self, now: float) -> str:
+        """A member found gone that may be back; empty: none."""
+        self._gone = {name: at for name, at in self._gone.items() if now - at < _LOST_S}
+        return self._rng.choice(list(self._gone)) if self._gone else ""
 
     def _usable(self, told: Around, now: float) -> Around:
         return Around(

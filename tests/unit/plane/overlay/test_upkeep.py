@@ -159,3 +159,22 @@ def test_members_that_leave_each_other_out_are_not_met_in_circles() -> None:
         rounds += 1
     assert {one, other} <= set(upkeep.view.names)
     assert rounds < 60
+
+
+def test_two_halves_that_lost_each_other_grow_together() -> None:
+    """After a cut both halves are rings of their own; once linked again they become one, though nobody tells them."""
+    fleet = Fleet(bound=24, seed=5).settled(f"gw-{n}" for n in range(40))
+    halves = [{f"gw-{n}" for n in range(start, 40, 2)} for start in (0, 1)]
+    for half, other in (halves, reversed(halves)):
+        for name in sorted(half):
+            for gone in sorted(other):
+                fleet.members[name].unreachable(gone, fleet.now)
+    everybody = dict(fleet.members)
+    for half in halves:
+        fleet.members = {name: everybody[name] for name in half}
+        fleet.rounds(20)
+        check_neighbours(fleet)
+    fleet.members = everybody
+    fleet.rounds(200)
+    check_neighbours(fleet)
+    check_closed(fleet)

@@ -1,0 +1,253 @@
+"""Membership of a fleet too large for everybody to know everybody: the shell round `overlay`.
+
+In place of a liveliness subscription to all gateways, each keeps the bounded view that `overlay.upkeep` decides on,
+watches the tokens of just those members, and finds the owner of a key by asking its way there. For the rest of the
+plane it is a `Membership`: the members are those known, and the ring is made of them.
+"""
+
+import asyncio
+import contextlib
+import random
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane.keys import check_name
+from appliance.plane.membership import Membership
+from appliance.plane.overlay.lookup import Lookup, NextAsk, Owners
+from appliance.plane.overlay.upkeep import LeaveAsk, Meet, MeetAsk, Seek, Upkeep
+from appliance.plane.overlay.view import Around, Step, View
+from appliance.plane.ring import RING_BITS, RING_SIZE, Ring, position
+from appliance.plane.rpc import Rpc
+from appliance.plane.session import Closer, Session
+
+log = structlog.get_logger(__name__)
+
+_ASK_S = 1.0
+"""One question of a lookup or a round; nobody there is told at once, so this is for the frozen."""
+_JOIN_TRIES = 5
+_MOST_CONTACTS = 8
+"""Gateways that a joiner remembers of all whose tokens it sees: one would do."""
+
+
+class Heard(Struct, frozen=True):
+    """Answer to who leaves."""
+
+
+class BoundedMembership(Membership):
+    """The gateways that this one knows of a larger fleet, at most `bound`."""
+
+    def __init__(self, session: Session, rpc: Rpc, *, gateway: str, bound: int, replicas: int) -> None:
+        super().__init__(session, gateway=gateway, virtual_nodes=1)
+        self._me = gateway
+        self._rpc = rpc
+        self._replicas = replicas
+        self._rng = random.Random()  # noqa: S311 - spreads load, protects nothing
+        self._view = View.alone(gateway, bound=bound, replicas=replicas)
+        self._upkeep = Upkeep(self._view, rng=self._rng, now=self._now())
+        self._entered = False
+        """Before that nothing it could say of the ring is true."""
+        self._contacts: list[str] = []
+        self._watched: dict[str, Closer] = {}
+        self._sooner = asyncio.Event()
+        self._running: asyncio.Task[None] | None = None
+        rpc.register("ring_next", NextAsk, self._on_next, exchange=False)
+        rpc.register("ring_meet", MeetAsk, self._on_meet, exchange=False)
+        rpc.register("ring_leave", LeaveAsk, self._on_leave, exchange=False)
+
+    @staticmethod
+    def _now() -> float:
+        return asyncio.get_running_loop().time()
+
+    # --- what the plane asks ----------------------------------------------------------------------------------
+
+    def sees(self, name: str) -> bool:
+        """Whoever asks is there: a bounded view need not know it."""
+        del name
+        return True
+
+    def owns(self, key: str) -> bool:
+        """Whether a key belongs to this gateway, as far as it knows without a gap."""
+        return self._view.step(position(key)).mine
+
+    async def holders(self, key: str, n: int) -> tuple[str, ...]:
+        """The first `n` gateways from the key's position on, found by asking; UnreachableError when nobody knows."""
+        found = await self._look_up(position(key))
+        if found is None:
+            raise UnreachableError(f"the owner of {key} was not found", remedy="try again in a second")
+        return (found.owner, *found.replicas)[:n]
+
+    # --- joining and leaving ----------------------------------------------------------------------------------
+
+    def add(self, name: str) -> None:
+        """Remember a gateway to join through."""
+        if name != self._me:
+            self._contacts = [*self._contacts, name][-_MOST_CONTACTS:]
+
+    def start(self) -> None:
+        """Nothing to watch yet: `enter` finds out whom."""
+
+    async def enter(self) -> None:
+        """Find this gateway's place on the ring and its neighbours; errors as for `Plane.open`."""
+        if not self._contacts:
+            self._run()
+            return
+        for _ in range(_JOIN_TRIES):
+            view = View(self._me, bound=self._view.bound, replicas=self._replicas)
+            view.hear(self._contacts)
+            self._view, self._upkeep = view, Upkeep(view, rng=self._rng, now=self._now())
+            found = await self._look_up((view.origin + 1) % RING_SIZE)
+            if found is None or found.owner == self._me:
+                continue
+            with contextlib.suppress(SwiftbotError):
+                ask = MeetAsk(self._me, all=True)
+                told = await self._rpc.call(found.owner, "ring_meet", ask, Around, timeout_s=_ASK_S)
+                self._upkeep.joined(found.owner, told, self._now())
+                self._follow()
+                self._run()
+                return
+        raise UnreachableError("no member of the ring answers", remedy="is the fleet up, and linked?")
+
+    def _run(self) -> None:
+        self._entered = True
+        self._running = asyncio.create_task(self._keep_up(), name="ring")
+
+    async def leave(self) -> None:
+        """Tell the neighbours, and stop."""
+        if self._running is None:
+            return
+        self._running.cancel()
+        await asyncio.gather(self._running, return_exceptions=True)
+        self._running = None
+        ask, near = self._upkeep.leaving()
+
+        async def tell(name: str) -> None:
+            with contextlib.suppress(SwiftbotError):
+                await self._rpc.call(name, "ring_leave", ask, Heard, timeout_s=_ASK_S)
+
+        await asyncio.gather(*(tell(name) for name in near))
+
+    def close(self) -> None:
+        """Take the token back and watch nobody any more."""
+        super().close()
+        for closer in self._watched.values():
+            closer.close()
+        self._watched.clear()
+
+    # --- upkeep -----------------------------------------------------------------------------------------------
+
+    async def _keep_up(self) -> None:
+        while True:
+            self._sooner.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout_at(self._upkeep.next_at):
+                    await self._sooner.wait()
+                    continue
+            try:
+                await self._round()
+            except Exception:  # supervision boundary: the ring must be kept up whatever one round ran into
+                log.exception("a round of the ring failed")
+
+    async def _round(self) -> None:
+        match self._upkeep.due(self._now()):
+            case Meet(member):
+                try:
+                    told = await self._rpc.call(member, "ring_meet", MeetAsk(self._me), Around, timeout_s=_ASK_S)
+                except (UnreachableError, DeadlineError):
+                    self._upkeep.unreachable(member, self._now())
+                except SwiftbotError as error:
+                    log.warning("a member does not meet", member=member, reason=str(error))
+                else:
+                    self._upkeep.met(member, _checked(told), self._now())
+            case Seek(target):
+                found = await self._look_up(target)
+                if found is not None:
+                    self._upkeep.found((found.owner, *found.replicas), self._now())
+            case None:
+                pass
+        self._follow()
+
+    async def _look_up(self, target: int) -> Owners | None:
+        lookup = Lookup(target, self._view)
+        while (name := lookup.next()) is not None:
+            ask = NextAsk(f"{target:040x}", named=lookup.named(name))
+            try:
+                step = await self._rpc.call(name, "ring_next", ask, Step, timeout_s=_ASK_S)
+            except (UnreachableError, DeadlineError):
+                lookup.failed(name)
+                self._upkeep.unreachable(name, self._now(), in_round=False)
+            except (RefusedError, PayloadError):
+                lookup.failed(name)
+            else:
+                lookup.answered(name, step)
+        if lookup.gone:
+            self._follow()
+        return lookup.result
+
+    def _follow(self) -> None:
+        """Watch the tokens of those in the view, and tell the rest of the plane who came and went."""
+        known = frozenset(self._view.names)
+        before = self._members - {self._me}
+        for name in before - known:
+            closer = self._watched.pop(name, None)
+            if closer is not None:
+                closer.close()
+        for name in known - self._watched.keys():
+            self._watched[name] = self._session.watch_alive(self._session.keys.alive(name), self._on_token)
+        if known == before:
+            return
+        self._members = known | {self._me}
+        self.ring = Ring(self._members, virtual_nodes=1)
+        for name in sorted(known - before):
+            self._tell(self.on_joined, name)
+        for name in sorted(before - known):
+            self._tell(self.on_lost, name)
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        name = key.split("/")[-2]
+        if not alive and name in self._view:
+            self._upkeep.unreachable(name, self._now())
+            self._upkeep.next_at = min(self._upkeep.next_at, self._now() + self._upkeep.interval_s)
+            self._sooner.set()
+            self._follow()
+
+    # --- answering --------------------------------------------------------------------------------------------
+
+    async def _on_next(self, asked: NextAsk) -> Step:
+        self._check_entered()
+        try:
+            target = int(asked.position, 16)
+        except ValueError:
+            target = -1
+        if not 0 <= target < 2**RING_BITS or len(asked.position) > RING_BITS // 4:
+            raise PayloadError(f"{asked.position[:80]!r} is no position", remedy="40 hex digits")
+        return self._view.step(target, named=asked.named)
+
+    async def _on_meet(self, asked: MeetAsk) -> Around:
+        self._check_entered()
+        check_name(asked.asker, "gateway")
+        before = self._upkeep.next_at
+        told = self._upkeep.asked(asked, self._now())
+        if self._upkeep.next_at < before:
+            self._sooner.set()
+        self._follow()
+        return told
+
+    def _check_entered(self) -> None:
+        if not self._entered:
+            raise RefusedError(f"{self._me} is only joining", remedy="ask another gateway")
+
+    async def _on_leave(self, asked: LeaveAsk) -> Heard:
+        check_name(asked.leaver, "gateway")
+        _checked(asked.around)
+        self._upkeep.left(asked, self._now())
+        self._follow()
+        return Heard()
+
+
+def _checked(told: Around) -> Around:
+    """Refuse names that are none: they would become keys."""
+    for name in (*told.before, *told.after, *told.others):
+        check_name(name, "gateway")
+    return told

@@ -1,0 +1,92 @@
+"""Gateways that know only some of the others: one ring all the same, records found hop by hop."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.errors import ConflictError, PayloadError
+from appliance.plane.node import Plane
+from appliance.plane.overlay.lookup import NextAsk
+from appliance.plane.overlay.view import Step
+from appliance.plane.ring import Ring
+from appliance.plane.router import run_router
+from appliance.plane.settings import PlaneConfig
+
+pytestmark = [pytest.mark.anyio, pytest.mark.timeout(300)]
+
+COUNT = 24
+VIEW = 16
+
+
+async def _until(condition: Callable[[], object]) -> None:
+    """Wait until something is so; the test's own timeout bounds it."""
+    while not condition():
+        await asyncio.sleep(0.05)
+
+
+@contextlib.asynccontextmanager
+async def _fleet(folder: Path, port: int) -> AsyncIterator[dict[str, Plane]]:
+    """Gateways that are clients of one router and know at most VIEW others."""
+    at = f"tcp/127.0.0.1:{port}"
+    stop, opened = asyncio.Event(), asyncio.get_running_loop().create_future()
+    router = PlaneConfig(mode="router", listen=(at,))
+    running = asyncio.create_task(run_router(router, stop=stop, ready=opened.set_result, alive=lambda: None))
+    await opened
+    planes: dict[str, Plane] = {}
+    try:
+        for number in range(COUNT):
+            config = PlaneConfig(mode="client", connect=(at,), view=VIEW)
+            name = f"g{number}"
+            planes[name] = await Plane.open(config, fleet="f", gateway=name, data_dir=folder / name)
+        yield planes
+    finally:
+        for plane in planes.values():
+            await plane.close()
+        stop.set()
+        await running
+
+
+def _neighbours_known(planes: dict[str, Plane]) -> bool:
+    """Whether every gateway's two next members are the true ones, and its predecessor too."""
+    line = Ring(planes, virtual_nodes=1).names
+    for place, name in enumerate(line):
+        known = planes[name].members()
+        if not {line[place - 1], line[(place + 1) % len(line)], line[(place + 2) % len(line)]} <= known:
+            return False
+    return True
+
+
+async def test_records_are_found_through_bounded_views(tmp_path: Path, free_port: int) -> None:
+    """What one gateway writes any other reads, with r copies at the true owner and its successors; then half leave."""
+    async with _fleet(tmp_path, free_port) as planes:
+        await _until(lambda: _neighbours_known(planes))
+        assert all(len(plane.members()) <= VIEW + 1 for plane in planes.values())
+        names = sorted(planes)
+        ring = Ring(planes, virtual_nodes=1)
+        versions = {}
+        for number in range(40):
+            key = f"key/{number}"
+            versions[key] = await planes[names[number % COUNT]].dht.write(key, b"1", expected=None)
+            owner, *others = ring.successors(key, 3)
+            assert set(versions[key]) == {owner}
+            for holder in (owner, *others):
+                assert await planes[holder].store.record(key) is not None
+            read = await planes[names[(number + 7) % COUNT]].dht.read(key)
+            assert read is not None
+            assert read.version == versions[key]
+            with pytest.raises(ConflictError):
+                await planes[names[(number + 11) % COUNT]].dht.write(key, b"2", expected=None)
+        with pytest.raises(PayloadError):
+            await planes["g0"].rpc.call("g1", "ring_next", NextAsk("no position"), Step)
+
+        for name in names[::6]:
+            await planes.pop(name).close()
+        await _until(lambda: _neighbours_known(planes))
+        left = sorted(planes)
+        for number, (key, version) in enumerate(versions.items()):
+            read = await planes[left[number % len(left)]].dht.read(key)
+            assert read is not None
+            assert read.version == version
