@@ -38,7 +38,8 @@ class RobotHub:
         self._site = site
         self._tasks = tasks
         self.refused: dict[str, int] = {}
-        self._intake = None if on_task is None else TaskIntake(session, on_task, self.refused)
+        submit = None if tasks is None else tasks.submit
+        self._intake = None if on_task is None else TaskIntake(session, on_task, self.refused, submit=submit)
         self._station: Station | None = None
 
     @property

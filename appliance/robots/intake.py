@@ -1,18 +1,20 @@
-"""Tasks that robots ask for: what they put on `robot/{id}/task` goes to the composition root.
+"""Tasks that robots ask for on `robot/{id}/task`: what they put, or query, goes to the composition root.
 
-This room knows nothing of tasks, so it only checks, bounds and hands over. Every gateway of the fleet hears the
-put; a request without an id gets one made of the robot, the text and the publisher's second, so that several
-gateways that submit it submit one task.
+This room knows nothing of tasks, so it only checks, bounds and hands over. A put is heard by every gateway of the
+fleet and answered by none; a request without an id gets one made of the robot, the text and the publisher's second,
+so that several gateways that submit it submit one task. A query goes to one gateway, and its answer is the task's
+record once that is durable, or the reason why not.
 """
 
 import hashlib
-from collections.abc import Callable
+import time
+from collections.abc import Awaitable, Callable
 
 import msgspec
 import structlog
 
 from appliance.errors import PayloadError
-from appliance.model import TaskRequest
+from appliance.model import TaskRecord, TaskRequest, encode
 from appliance.plane.keys import check_name
 from appliance.plane.session import Closer, Message, Session
 
@@ -24,28 +26,51 @@ _SECOND_NS = 1_000_000_000
 
 
 class TaskIntake:
-    """Subscribes to the robots' task key; `on_task(robot, request)` is called on the event loop."""
+    """Listens on the robots' task key.
+
+    Args:
+        session: this gateway's.
+        on_task: given each robot and what it put, on the event loop.
+        refused: counters of bad input.
+        submit: hands in what was asked by query; None: queries are not answered here.
+    """
 
     def __init__(
         self,
         session: Session,
         on_task: Callable[[str, TaskRequest], None],
         refused: dict[str, int] | None = None,
+        *,
+        submit: Callable[[TaskRequest], Awaitable[TaskRecord]] | None = None,
     ) -> None:
         self._session = session
         self._on_task = on_task
-        self._closer: Closer | None = None
+        self._submit = submit
+        self._closers: list[Closer] = []
         self.refused: dict[str, int] = {} if refused is None else refused
 
     def start(self) -> None:
         """Begin to listen."""
-        self._closer = self._session.subscribe(self._session.keys.intake(), self._heard)
+        key = self._session.keys.intake()
+        self._closers.append(self._session.subscribe(key, self._heard))
+        if self._submit is not None:
+            self._closers.append(self._session.serve(key, self._asked))
 
     def stop(self) -> None:
         """Stop listening."""
-        if self._closer is not None:
-            self._closer.close()
-            self._closer = None
+        for closer in self._closers:
+            closer.close()
+        self._closers.clear()
+
+    async def _asked(self, key: str, payload: bytes) -> bytes:
+        """Answer a query; errors are told to whoever asks."""
+        assert self._submit is not None  # noqa: S101 - only served with one
+        try:
+            _, request = read_request(Message(key, payload, False, time.time_ns(), ""))
+        except PayloadError:
+            self.refused["task_malformed"] = self.refused.get("task_malformed", 0) + 1
+            raise
+        return encode(await self._submit(request))
 
     def _heard(self, message: Message) -> None:
         if message.deleted:

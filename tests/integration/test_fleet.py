@@ -28,6 +28,7 @@ from appliance.record.reader import read
 from appliance.robots.client import TaskClient, TaskRejected
 from appliance.robots.mavlink.requests import task_number
 from appliance.robots.settings import RobotsConfig, Template
+from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskRejected
 from appliance.tasks.replay import replay
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
@@ -50,6 +51,27 @@ async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
         yield state
     finally:
         await local_fleet.down(order.directory, progress=print)
+
+
+async def test_a_task_by_zenoh(fleet: FleetState, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot asks by query: the answer comes when the task is durable, asked again it is the same, and it is followed.
+
+    What is refused is told with its reason.
+    """
+    monkeypatch.setattr("appliance.robots.zenoh_client.LOOK_S", 0.2)  # so that it is looked at as well as heard of
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps(fleet.endpoints))
+    with await asyncio.to_thread(zenoh.open, config) as session:
+        client = AsyncZenohTaskClient(session, fleet=fleet.fleet, robot="rover_1")
+        for _ in range(2):
+            assert await client.submit("Rover_1: go to dock 3", task="by-zenoh") == "by-zenoh"
+        states = [record["state"] async for record in client.follow("by-zenoh", timeout_s=90)]
+        assert states[-1] == "succeeded"
+        with pytest.raises(ZenohTaskRejected, match="1 to") as refused:
+            await client.submit(" ")
+        assert refused.value.code == "payload"
+    assert set(commands_in(fleet, "by-zenoh").values()) == {1}
 
 
 async def test_a_task_by_mavlink(tmp_path: Path) -> None:
@@ -292,6 +314,7 @@ async def test_garbage_on_every_key_is_refused_and_counted(fleet: FleetState) ->
 
 def _ask_raw(fleet: FleetState, key: str, payload: bytes) -> list[bool]:
     """Query a key with raw bytes; for each reply whether it was a success."""
+    monkeypatch.setattr("appliance.robots.zenoh_client.LOOK_S", 0.2)  # so that it is looked at as well as heard of
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([fleet.endpoints[0]]))

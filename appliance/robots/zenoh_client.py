@@ -1,0 +1,137 @@
+"""What a robot that speaks Zenoh asks tasks of the fleet with. Needs eclipse-zenoh and nothing else; can be copied.
+
+    session = zenoh.open(config)
+    client = ZenohTaskClient(session, fleet="local", robot="rover_1")
+    task = client.submit("bring me to the charger", task="rover-1-17")     # the same id again is the same task
+    for record in client.follow(task):
+        print(record["state"])
+
+Records are TaskRecords as docs/schemas/TaskRecord.json describes them. `AsyncZenohTaskClient` is the same for asyncio.
+"""
+
+import asyncio
+import json
+import queue
+import secrets
+import time
+from collections.abc import AsyncIterator, Iterator
+from typing import Any, cast
+
+FINAL = frozenset({"succeeded", "failed", "cancelled"})
+"""States after which nothing follows."""
+LOOK_S = 5.0
+"""How often a task is looked at while nothing is heard of it: a put may be lost when a gateway dies."""
+
+Record = dict[str, Any]
+
+
+class ZenohTaskRejected(Exception):  # noqa: N818 - what it says
+    """The fleet will not do it; `code` and `remedy` are the gateway's."""
+
+    def __init__(self, message: str, *, code: str = "", remedy: str = "") -> None:
+        super().__init__(message)
+        self.code = code
+        self.remedy = remedy
+
+
+class ZenohTaskClient:
+    """Asks for tasks and hears of them; thread-safe as far as the session is.
+
+    Args:
+        session: an open `zenoh.Session`, of any mode.
+        fleet: the fleet's name.
+        robot: the robot's name, as in the roster.
+    """
+
+    def __init__(self, session: Any, *, fleet: str, robot: str) -> None:
+        self._session = session
+        self._root = f"swiftbot/{fleet}"
+        self._robot = robot
+
+    def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0) -> str:
+        """Ask for a task; returns its id once it is durable on its replicas.
+
+        Args:
+            instruction: what to do, in words.
+            task: its id; asked again with the same one, it is the same task. Made up when empty.
+            timeout_s: how long the fleet is waited for.
+
+        Raises:
+            ZenohTaskRejected: it will not be done, and why.
+            TimeoutError: no gateway answered; asking again with the same id is safe.
+        """
+        task = task or f"r-{secrets.token_hex(6)}"
+        record = self._ask(f"robot/{self._robot}/task", {"instruction": instruction, "id": task}, timeout_s)
+        return str(record["id"])
+
+    def follow(self, task: str, *, timeout_s: float = 3600.0) -> Iterator[Record]:
+        """Yield a task's record whenever it changes, until it ends; TimeoutError when it does not by then."""
+        until = time.monotonic() + timeout_s
+        heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+        def take(sample: Any) -> None:
+            heard.put(sample.payload.to_bytes())
+
+        subscriber = self._session.declare_subscriber(f"{self._root}/task/{task}/record", take)
+        try:
+            last = -1
+            while True:
+                try:
+                    record = _table(heard.get(timeout=max(0.0, min(LOOK_S, until - time.monotonic()))))
+                except queue.Empty:
+                    record = self._look(task)
+                sequence = int(record.get("sequence", 0))
+                if sequence > last:
+                    last = sequence
+                    yield record
+                    if record.get("state") in FINAL:
+                        return
+                if time.monotonic() > until:
+                    raise TimeoutError(f"task {task} has not ended within {timeout_s:g} s")
+        finally:
+            subscriber.undeclare()
+
+    def _look(self, task: str) -> Record:
+        """Ask the gateways for a task's record; empty when none answers just now."""
+        key = f"{self._root}/gw/*/rpc/task"
+        for reply in self._session.get(key, payload=json.dumps({"id": task}).encode(), timeout=LOOK_S):
+            if reply.ok is not None:
+                return _table(reply.ok.payload.to_bytes())
+        return {}
+
+    def _ask(self, key: str, request: dict[str, str], timeout_s: float) -> Record:
+        payload = json.dumps(request).encode()
+        for reply in self._session.get(f"{self._root}/{key}", payload=payload, timeout=timeout_s):
+            if reply.ok is not None:
+                return _table(reply.ok.payload.to_bytes())
+            error = _table(reply.err.payload.to_bytes())
+            if error.get("code"):
+                raise ZenohTaskRejected(
+                    str(error.get("message", "")), code=str(error["code"]), remedy=str(error.get("remedy", ""))
+                )
+        raise TimeoutError("no gateway answered; asking again with the same id is safe")
+
+
+class AsyncZenohTaskClient:
+    """The same for asyncio; arguments as `ZenohTaskClient`. Waiting is done in threads."""
+
+    def __init__(self, session: Any, *, fleet: str, robot: str) -> None:
+        self._client = ZenohTaskClient(session, fleet=fleet, robot=robot)
+
+    async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0) -> str:
+        """As `ZenohTaskClient.submit`."""
+        return await asyncio.to_thread(self._client.submit, instruction, task=task, timeout_s=timeout_s)
+
+    async def follow(self, task: str, *, timeout_s: float = 3600.0) -> AsyncIterator[Record]:
+        """As `ZenohTaskClient.follow`."""
+        records = self._client.follow(task, timeout_s=timeout_s)
+        while (record := await asyncio.to_thread(next, records, None)) is not None:
+            yield record
+
+
+def _table(data: bytes) -> Record:
+    try:
+        value = json.loads(data)
+    except ValueError:
+        return {}
+    return cast("Record", value) if isinstance(value, dict) else {}
