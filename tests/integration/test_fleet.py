@@ -314,7 +314,6 @@ async def test_garbage_on_every_key_is_refused_and_counted(fleet: FleetState) ->
 
 def _ask_raw(fleet: FleetState, key: str, payload: bytes) -> list[bool]:
     """Query a key with raw bytes; for each reply whether it was a success."""
-    monkeypatch.setattr("appliance.robots.zenoh_client.LOOK_S", 0.2)  # so that it is looked at as well as heard of
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([fleet.endpoints[0]]))
