@@ -111,7 +111,7 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     idle times of each image say that it is due; `rate`: arrival rate × service time, to `hit_target`."""
     hit_target: Annotated[float, Meta(gt=0, lt=1)] = 0.95
     """Part of the runs of an often used image that shall find a warm container, by `rate`."""
-    keep: Literal["fixed", "histogram"] = "fixed"
+    keep: Literal["fixed", "histogram", "worth"] = "fixed"
     """How long an idle container is kept: `fixed`: for `idle_s`; `histogram`: until the 99th percentile of its image's
     idle times, or not at all before the 5th when that is long; `idle_s` where they say nothing."""
     idle_s: Positive = 600.0

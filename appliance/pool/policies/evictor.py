@@ -17,7 +17,7 @@ class Evictor(Protocol):
         ...
 
     def worths(self, idle: Sequence[Idle], now: float) -> list[float]:
-        """Return what each of these containers is worth, in their order. Changes nothing that a decision rests on."""
+        """Return what each of these containers is worth, in their order; one without id is yet to be started."""
         ...
 
     def evicted(self, idle: Idle, now: float) -> None:

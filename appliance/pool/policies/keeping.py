@@ -5,6 +5,8 @@ from typing import Protocol
 from appliance.pool.policies.facts import Idle
 from appliance.pool.policies.forecaster import Level
 from appliance.pool.policies.histogram import Histogram
+from appliance.pool.policies.learned import Learned
+from appliance.pool.settings import PoolConfig
 
 
 class Keeping(Protocol):
@@ -38,3 +40,29 @@ class KeepHistogram:
         """Give up what is outside its window."""
         why = self._histogram.rests(level, idle.since, now)
         return self._otherwise.rests(idle, level, now) if why is None else why
+
+
+class KeepWorth:
+    """For as long as it is worth its memory: a small one that is dear to start waits longer than a large cheap one.
+
+    One of usual size and start cost (pool.container_memory_mb, pool.cold_ms) is kept while it is expected to be used
+    within `idle_s`; one of twice the memory within half of it. Where the learned policy does not trust its
+    predictions, the fixed time counts. A level whose idle times say that it is not due for a while rests.
+    """
+
+    def __init__(self, learned: Learned, histogram: Histogram | None, settings: PoolConfig, otherwise: Keeping) -> None:
+        self._learned = learned
+        self._histogram = histogram
+        self._price = settings.cold_ms / (settings.container_memory_mb * settings.idle_s)
+        self._otherwise = otherwise
+
+    def rests(self, idle: Idle, level: Level, now: float) -> str:
+        """Give up what is worth less than its memory."""
+        if self._histogram is not None and (why := self._histogram.rests(level, idle.since, now)):
+            return why
+        wait_s = self._learned.wait_s(idle, level.number, now)
+        if wait_s is None:
+            return self._otherwise.rests(idle, level, now)
+        if idle.cold_ms / (idle.memory_mb * wait_s) >= self._price:
+            return ""
+        return f"not expected to be used for {wait_s:.0f} s"

@@ -126,17 +126,34 @@ class Learned:
     def worths(self, idle: Sequence[Idle], now: float) -> list[float]:
         """Return cold start saved over memory times predicted time, ms/(MB s); or Greedy-Dual's priorities."""
         greedy = self._greedy.worths(idle, now)
+        if not idle:
+            return greedy
         levels = self._levels(idle)
         features = [self._features(each, level, now) for each, level in zip(idle, levels, strict=True)]
-        if not features:
-            return []
-        predicted = np.exp(np.clip(np.array(features) @ self._weights, -3.0, 12.0)).tolist()
-        own = [each.cold_ms / (each.memory_mb * s) for each, s in zip(idle, predicted, strict=True)]
+        own = [
+            each.cold_ms / (each.memory_mb * s) for each, s in zip(idle, self._predict(np.array(features)), strict=True)
+        ]
         self._last = {
             each.id: (mine, theirs, (each.image, level), vector)
             for each, mine, theirs, level, vector in zip(idle, own, greedy, levels, features, strict=True)
         }
         return own if self.decides else greedy
+
+    def wait_s(self, idle: Idle, level: int, now: float) -> float | None:
+        """Return in how many seconds it will be used; None while the predictions are not to be trusted."""
+        if not self.decides:
+            return None
+        return self._predict(np.array(self._features(idle, level, now)))[0]
+
+    def observed(self, idle: Sequence[Idle], now: float) -> None:
+        """Take one of the idle containers, each in turn, as an example to learn from."""
+        if idle:
+            self._turn = (self._turn + 1) % len(idle)
+            each, level = idle[self._turn], self._levels(idle)[self._turn]
+            self._remember((each.image, level), self._features(each, level, now), now)
+
+    def _predict(self, features: Vector) -> list[float]:
+        return np.exp(np.clip(np.atleast_2d(features) @ self._weights, -3.0, 12.0)).tolist()
 
     def evicted(self, idle: Idle, now: float) -> None:
         """Note the eviction: a sample to learn from, and a duel if the two policies would have differed."""
@@ -149,16 +166,12 @@ class Learned:
             self._duels.append(_Duel(learned=mine[2], greedy=theirs[2], at=now))
         _, _, key, features = self._last.pop(idle.id)
         self._remember(key, features, now)
-        if self._last:  # and one of those that stay, each in turn
-            self._turn = (self._turn + 1) % len(self._last)
-            _, _, key, features = list(self._last.values())[self._turn]
-            self._remember(key, features, now)
 
     def _levels(self, idle: Sequence[Idle]) -> list[int]:
-        """Return the level that each would serve: the one used last serves the lowest that is free."""
+        """Return the level that each would serve: the one used last the lowest free, one yet to come the highest."""
         taken: dict[str, int] = {}
         levels = [0] * len(idle)
-        for index in sorted(range(len(idle)), key=lambda index: -idle[index].since):
+        for index in sorted(range(len(idle)), key=lambda index: (not idle[index].id, -idle[index].since)):
             image = idle[index].image
             demand = self._demand.images.get(image)
             before = taken.get(image, demand.runs if demand is not None else 0)
@@ -174,7 +187,7 @@ class Learned:
             gap_s = demand.gap_s(now)
             idle_s = now - demand.idle_since(level, idle.since)
             times = demand.idle_times(level)
-            usual_s = times.rest_s(idle_s) if times is not None and times.total >= 2 else 0.0
+            usual_s = times.price_s(idle_s) if times is not None else 0.0
         hint_s = self._next_hint_s(idle.image, now)
         turn = self._hour(now) * math.pi / 12
         return (

@@ -9,6 +9,7 @@ Guarantees, each a property test:
     - An image never falls below its floor, except for a run that waits or when the budget itself has shrunk.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
@@ -24,7 +25,7 @@ from appliance.pool.policies.forecaster import Forecaster, Level
 from appliance.pool.policies.greedy_dual import GreedyDual
 from appliance.pool.policies.hints import PlanHints
 from appliance.pool.policies.histogram import Histogram
-from appliance.pool.policies.keeping import KeepFixed, KeepHistogram, Keeping
+from appliance.pool.policies.keeping import KeepFixed, KeepHistogram, Keeping, KeepWorth
 from appliance.pool.policies.learned import Learned, LearnedState
 from appliance.pool.policies.least_recent import LeastRecent
 from appliance.pool.policies.rate import Rate
@@ -34,6 +35,10 @@ AHEAD = 1.5
 """A start is ordered so many times its usual duration ahead …"""
 AHEAD_S = 0.5
 """… and this much, for the pool is gone through twice a second."""
+LESS = 0.8
+"""A container is given up for one that is only forecast when it is worth less than this part of it."""
+FRESH_S = 60.0
+"""A container that was started ahead is not given up within that time to start another one ahead."""
 LEAST_STAY_S = 5.0
 """A container that was started ahead stays for at least so long: a forecast may waver."""
 
@@ -73,9 +78,16 @@ class Planner:
         rate = Rate(self._demand, hit_target=settings.hit_target, horizon_s=settings.idle_s)
         known: dict[str, Forecaster] = {"hints": self._hints, "histogram": histogram, "rate": rate}
         self._forecasters = [each for name, each in known.items() if name in settings.prewarm]
-        fixed = KeepFixed(settings.idle_s)
-        self._keeping: Keeping = KeepHistogram(histogram, fixed) if settings.keep == "histogram" else fixed
         self._learned = Learned(self._demand, next_hint_s=self._hints.next_s, hour=hour)
+        fixed = KeepFixed(settings.idle_s)
+        sharp = histogram if "histogram" in settings.prewarm else None
+        kinds: dict[str, Keeping] = {
+            "fixed": fixed,
+            "histogram": KeepHistogram(histogram, fixed),
+            "worth": KeepWorth(self._learned, sharp, settings, fixed),
+        }
+        self._keeping = kinds[settings.keep]
+        self._learns = settings.keep == "worth" or settings.eviction == "learned"
         policies: dict[str, Evictor] = {
             "greedy-dual": GreedyDual(),
             "lru": LeastRecent(),
@@ -121,15 +133,24 @@ class Planner:
             view: what there is.
             memory_mb: memory of the one to come.
             now: clock, seconds.
-            for_run: a run waits for it, so neither floors nor forecasts need be spared.
+            for_run: a run waits for it, so nothing idle need be spared.
         """
-        spare = {} if for_run else self._spared(view, now)
-        return self._room(view, memory_mb, now, spare)
+        slots, needed_mb = _lacking(view, memory_mb)
+        if slots <= 0 and needed_mb <= 0:
+            return ()
+        worths = self._evictor.worths(view.idle, now)
+        if for_run:
+            chosen = victims(view.idle, worths, slots=slots, memory_mb=needed_mb, spare={})
+        else:
+            chosen = self._cheaper(view, worths, slots, needed_mb, self._wanted(view, now), now)
+        return None if chosen is None else tuple(Retire(id=each.id, why="its place is needed") for each in chosen)
 
     def tend(self, view: View, now: float) -> tuple[tuple[Start, ...], tuple[Retire, ...]]:
         """Return what to start ahead and what to give up, to be carried out together, retirements first."""
+        if self._learns:
+            self._learned.observed(view.idle, now)
         wanted = self._wanted(view, now)
-        retired = self._overdue(view, {image: count for image, (count, _) in wanted.items()}, now)
+        retired = self._overdue(view, wanted, now)
         view = without(view, retired)
         for each in self._beyond_budget(view, now):
             retired[each.id] = "the budget has shrunk"
@@ -137,60 +158,101 @@ class Planner:
         view = without(view, retired)
         ready = Counter(each.image for each in view.idle)
         coming = {image: ready[image] + view.starting.get(image, 0) for image in wanted}
-        spare = {image: count for image, (count, _) in wanted.items()}
         starts: list[Start] = []
         places = self._settings.starts_at_once - sum(view.starting.values())
-        for image in missing(spare, coming):
+        worths: dict[str, float] = {}
+        for image in missing({image: each.count for image, each in wanted.items()}, coming):
             if len(starts) >= places:
                 break
-            size_mb = self._size_mb(image)
-            if image in view.blocked or (victims := self._room(view, size_mb, now, spare)) is None:
+            if image in view.blocked:
                 continue
-            starts.append(Start(image=image, why=wanted[image][1]))
-            gone = {each.id: each.why for each in victims}
-            for each in view.idle:
-                if each.id in gone:
-                    self._evictor.evicted(each, now)
-            retired |= gone
+            size_mb = self._size_mb(image)
+            slots, needed_mb = _lacking(view, size_mb)
+            chosen: tuple[Idle, ...] | None = ()
+            if slots > 0 or needed_mb > 0:
+                worths = worths or self._worths(view, [one for one in wanted if wanted[one].count > coming[one]], now)
+                bar = math.inf if coming[image] < wanted[image].sure else worths[_new(image)] * LESS
+                here = [worths[each.id] for each in view.idle]
+                chosen = self._cheaper(view, here, slots, needed_mb, wanted, now, bar=bar)
+            if chosen is None:
+                continue
+            coming[image] += 1
+            starts.append(Start(image=image, why=wanted[image].why))
+            for each in chosen:
+                retired[each.id] = "its place is needed"
+                self._evictor.evicted(each, now)
             view = with_start(without(view, retired), image, size_mb)
         return tuple(starts), tuple(Retire(id=key, why=why) for key, why in retired.items())
 
-    def _wanted(self, view: View, now: float) -> dict[str, tuple[int, str]]:
+    def _worths(self, view: View, short: Sequence[str], now: float) -> dict[str, float]:
+        """Return what the idle ones are worth, and what the next one of each image that is short would be."""
+        new = [
+            Idle(id="", image=image, memory_mb=self._size_mb(image), runs=0, cold_ms=self._costs.of(image), since=now)
+            for image in short
+        ]
+        worths = self._evictor.worths((*view.idle, *new), now)
+        return dict(zip((*(each.id for each in view.idle), *map(_new, short)), worths, strict=True))
+
+    @staticmethod
+    def _cheaper(
+        view: View,
+        worths: Sequence[float],
+        slots: int,
+        memory_mb: int,
+        wanted: Mapping[str, "_Wanted"],
+        now: float,
+        *,
+        bar: float = math.inf,
+    ) -> tuple[Idle, ...] | None:
+        """Return whom to give up for one that is started ahead: nobody who is surely wanted, new, or worth as much."""
+        open_to = [
+            (each, worth)
+            for each, worth in zip(view.idle, worths, strict=True)
+            if worth < bar and (each.runs or now - each.since >= FRESH_S)
+        ]
+        # What is spared counts all idle ones, also those that are not open to it.
+        closed = Counter(each.image for each in view.idle) - Counter(each.image for each, _ in open_to)
+        return victims(
+            [each for each, _ in open_to],
+            [worth for _, worth in open_to],
+            slots=slots,
+            memory_mb=memory_mb,
+            spare={image: each.sure - closed[image] for image, each in wanted.items()},
+        )
+
+    def _wanted(self, view: View, now: float) -> dict[str, "_Wanted"]:
         """Return how many idle or starting containers of each image are wanted, and why the last of them is."""
         images = {*self._settings.floor}
         for forecaster in self._forecasters:
             images.update(forecaster.images(now))
-        wanted: dict[str, tuple[int, str]] = {}
+        wanted: dict[str, _Wanted] = {}
         for image in images:
-            floor = self._settings.floor.get(image, 0)
             busy = view.busy.get(image, 0)
             ahead_s = self._ahead_s(image)
-            count, reason = 0, ""
+            count = sure = self._settings.floor.get(image, 0)
+            why = "floor"
             while count < view.capacity:
-                why = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
-                if not why:
+                reason, certain = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
+                if not reason:
                     break
-                count, reason = count + 1, why
-            if count > floor:
-                wanted[image] = (count, reason)
-            elif floor:
-                wanted[image] = (floor, "floor")
+                count, why = count + 1, reason
+                sure = count if certain else sure
+            if count:
+                wanted[image] = _Wanted(count, sure, why)
         return wanted
 
-    def _wants(self, level: Level, now: float) -> str:
+    def _wants(self, level: Level, now: float) -> tuple[str, bool]:
+        """Return why a level is wanted, empty when it is not, and whether that is sure: announced, not guessed."""
         for forecaster in self._forecasters:
             why = forecaster.wants(level, now)
             if why is not None:
-                return why
-        return ""
+                return why, forecaster is self._hints
+        return "", False
 
     def _ahead_s(self, image: str) -> float:
         return AHEAD * self._costs.of(image) / 1e3 + AHEAD_S
 
-    def _spared(self, view: View, now: float) -> dict[str, int]:
-        return {image: count for image, (count, _) in self._wanted(view, now).items()}
-
-    def _overdue(self, view: View, wanted: Mapping[str, int], now: float) -> dict[str, str]:
+    def _overdue(self, view: View, wanted: Mapping[str, "_Wanted"], now: float) -> dict[str, str]:
         """Return who has been kept for long enough: of each image those used last are the last to go."""
         by_image: dict[str, list[Idle]] = {}
         for each in view.idle:
@@ -198,7 +260,8 @@ class Planner:
         overdue: dict[str, str] = {}
         for image, idle in by_image.items():
             busy = view.busy.get(image, 0)
-            spare = max(0, wanted.get(image, 0) - view.starting.get(image, 0))
+            spare = wanted[image].count - view.starting.get(image, 0) if image in wanted else 0
+            spare = max(0, spare)
             if len(idle) <= spare:
                 continue
             ahead_s = self._ahead_s(image)
@@ -224,14 +287,23 @@ class Planner:
                 return chosen
         return view.idle
 
-    def _room(self, view: View, memory_mb: int, now: float, spare: Mapping[str, int]) -> tuple[Retire, ...] | None:
-        slots = view.containers + 1 - view.capacity
-        needed_mb = view.memory_mb + memory_mb - view.budget_mb
-        if slots <= 0 and needed_mb <= 0:
-            return ()
-        worths = self._evictor.worths(view.idle, now)
-        chosen = victims(view.idle, worths, slots=slots, memory_mb=needed_mb, spare=spare)
-        return None if chosen is None else tuple(Retire(id=each.id, why="its place is needed") for each in chosen)
+
+class _Wanted(Struct, frozen=True):
+    """Containers of an image that are wanted beside the busy ones."""
+
+    count: int
+    sure: int
+    """Of these, how many are the floor or announced by a plan, not only forecast."""
+    why: str
+
+
+def _new(image: str) -> str:
+    return f"new {image}"
+
+
+def _lacking(view: View, memory_mb: int) -> tuple[int, int]:
+    """Return the places and megabytes that are missing for one more container."""
+    return view.containers + 1 - view.capacity, view.memory_mb + memory_mb - view.budget_mb
 
 
 def victims(

@@ -41,9 +41,11 @@ class Rate:
         self._demand = demand
         self._hit_target = hit_target
         self._horizon_s = horizon_s
+        self._wanted: dict[str, tuple[float, int]] = {}
 
     def images(self, now: float) -> Iterable[str]:
         """Return the images that are asked for often enough."""
+        self._wanted.clear()
         return [
             image
             for image, demand in self._demand.images.items()
@@ -58,6 +60,8 @@ class Rate:
         gap_s = demand.gap_s(now)
         if gap_s >= self._horizon_s:
             return None
-        if containers_for((demand.service_s + level.ahead_s) / gap_s, self._hit_target) < level.number:
-            return ""
-        return f"one is wanted every {gap_s:.1f} s for {demand.service_s:.1f} s"
+        at, count = self._wanted.get(level.image, (-1.0, 0))
+        if at != now:
+            count = containers_for((demand.service_s + level.ahead_s) / gap_s, self._hit_target)
+            self._wanted[level.image] = (now, count)
+        return f"one is wanted every {gap_s:.1f} s for {demand.service_s:.1f} s" if level.number <= count else ""
