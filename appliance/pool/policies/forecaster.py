@@ -1,5 +1,6 @@
 """The interface of prewarming: whether the n-th container of an image is wanted by the time one could be ready."""
 
+import enum
 from collections.abc import Iterable
 from typing import Protocol
 
@@ -18,8 +19,22 @@ class Level(Struct, frozen=True):
     """How long a new one takes to be ready, with a margin, seconds."""
 
 
+class Surety(enum.IntEnum):
+    """How sure a forecast is, so what may be given up for it."""
+
+    SPARE_ROOM = 0
+    """Only started where there is room."""
+    LESS_WORTH = 1
+    """Takes the place of what is worth less."""
+    CERTAIN = 2
+    """Takes the place of whatever is not as certain; is spared by all but waiting runs."""
+
+
 class Forecaster(Protocol):
     """Forecasters are asked in turn, the surest first; the first with an opinion counts."""
+
+    surety: Surety
+    """What a container it wants may do to those that are there."""
 
     def images(self, now: float) -> Iterable[str]:
         """Return the images it may want containers of."""

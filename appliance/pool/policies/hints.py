@@ -6,7 +6,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.model import PoolHint
-from appliance.pool.policies.forecaster import Level
+from appliance.pool.policies.forecaster import Level, Surety
 
 MAX_HINTS = 256
 EARLY_S = 10.0
@@ -21,6 +21,8 @@ class _Hint(Struct, frozen=True):
 
 class PlanHints:
     """What plans have announced. A hint of the same task and image replaces the earlier one."""
+
+    surety = Surety.CERTAIN
 
     def __init__(self) -> None:
         self._hints: dict[tuple[str, str], _Hint] = {}

@@ -8,7 +8,7 @@ histogram is not representative, others are asked.
 from collections.abc import Iterable
 
 from appliance.pool.policies.demand import Demand
-from appliance.pool.policies.forecaster import Level
+from appliance.pool.policies.forecaster import Level, Surety
 
 LEAST_REST_S = 5.0
 """A container is not given up to be started again sooner than this, nor than ten cold starts."""
@@ -18,6 +18,8 @@ MARGIN = 0.1
 
 class Histogram:
     """Prewarming and keeping by the idle times of each level of each image."""
+
+    surety = Surety.LESS_WORTH
 
     def __init__(self, demand: Demand) -> None:
         self._demand = demand

@@ -98,16 +98,16 @@ class IdleTimes:
         return found
 
     def _price_s(self, first: int) -> float:
+        seen = [(index, count) for index, count in enumerate(self.counts[first:], first) if count]
         from_s = lower_s(first)
-        left = sum(self.counts[first:]) + 1.0
+        left = sum(count for _, count in seen) + 1.0
         spent_s = uses = 0.0
         best_s = 10 * DAY_S
-        for index in range(first, BUCKETS):
-            count = self.counts[index]
-            if count:
-                end_s = UPPER_S[index] - from_s
-                uses += count
-                left -= count
-                spent_s += count * max(MIDDLE_S[index] - from_s, end_s / 2)
-                best_s = min(best_s, (spent_s + left * end_s) / uses)
+        for index, count in seen:
+            end_s = UPPER_S[index] - from_s
+            uses += count
+            left -= count
+            spent_s += count * (MIDDLE_S[index] - from_s if index > first else end_s / 2)
+            price_s = (spent_s + left * end_s) / uses
+            best_s = min(best_s, price_s)
         return best_s

@@ -12,6 +12,7 @@ differ: whoever would have given up what was asked for first has lost.
 """
 
 import math
+import operator
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -85,6 +86,7 @@ class Learned:
         self._weights: Vector = np.zeros(FEATURES)
         # Before anything is known: as long again as the expected gap and as it was idle, evenly.
         self._weights[1] = self._weights[2] = 0.5
+        self._model: list[float] = self._weights.tolist()
         self._covariance: Vector = np.eye(FEATURES) * 10.0
         self._seen = 0
         self._balance = 0.0
@@ -112,6 +114,7 @@ class Learned:
         weights, covariance = np.array(state.weights), np.array(state.covariance)
         if weights.shape == (FEATURES,) and covariance.shape == (FEATURES, FEATURES) and np.isfinite(covariance).all():
             self._weights, self._covariance = weights, covariance
+            self._model = self._weights.tolist()
             self._seen, self._balance = state.seen, state.balance
 
     def arrived(self, image: str, now: float) -> None:
@@ -131,7 +134,7 @@ class Learned:
         levels = self._levels(idle)
         features = [self._features(each, level, now) for each, level in zip(idle, levels, strict=True)]
         own = [
-            each.cold_ms / (each.memory_mb * s) for each, s in zip(idle, self._predict(np.array(features)), strict=True)
+            each.cold_ms / (each.memory_mb * self._predict(vector)) for each, vector in zip(idle, features, strict=True)
         ]
         self._last = {
             each.id: (mine, theirs, (each.image, level), vector)
@@ -143,7 +146,7 @@ class Learned:
         """Return in how many seconds it will be used; None while the predictions are not to be trusted."""
         if not self.decides:
             return None
-        return self._predict(np.array(self._features(idle, level, now)))[0]
+        return self._predict(self._features(idle, level, now))
 
     def observed(self, idle: Sequence[Idle], now: float) -> None:
         """Take one of the idle containers, each in turn, as an example to learn from."""
@@ -152,8 +155,10 @@ class Learned:
             each, level = idle[self._turn], self._levels(idle)[self._turn]
             self._remember((each.image, level), self._features(each, level, now), now)
 
-    def _predict(self, features: Vector) -> list[float]:
-        return np.exp(np.clip(np.atleast_2d(features) @ self._weights, -3.0, 12.0)).tolist()
+    def _predict(self, features: tuple[float, ...]) -> float:
+        """Return the predicted seconds to the next use. Plain lists: for ten numbers quicker than an array."""
+        exponent = sum(map(operator.mul, self._model, features))
+        return math.exp(min(12.0, max(-3.0, exponent)))
 
     def evicted(self, idle: Idle, now: float) -> None:
         """Note the eviction: a sample to learn from, and a duel if the two policies would have differed."""
@@ -217,6 +222,7 @@ class Learned:
         direction = self._covariance @ x
         gain = direction / (FORGET + float(x @ direction))
         self._weights = self._weights + gain * (y - float(x @ self._weights))
+        self._model = self._weights.tolist()
         self._covariance = (self._covariance - np.outer(gain, direction)) / FORGET
         trace = float(np.trace(self._covariance))
         if trace > 1e4:  # nothing new in some direction for long: forgetting must not blow it up

@@ -21,7 +21,7 @@ from appliance.pool.policies.costs import ColdCosts
 from appliance.pool.policies.demand import Demand
 from appliance.pool.policies.evictor import Evictor
 from appliance.pool.policies.facts import Idle, Retire, Start, View
-from appliance.pool.policies.forecaster import Forecaster, Level
+from appliance.pool.policies.forecaster import Forecaster, Level, Surety
 from appliance.pool.policies.greedy_dual import GreedyDual
 from appliance.pool.policies.hints import PlanHints
 from appliance.pool.policies.histogram import Histogram
@@ -39,6 +39,8 @@ LESS = 0.8
 """A container is given up for one that is only forecast when it is worth less than this part of it."""
 FRESH_S = 60.0
 """A container that was started ahead is not given up within that time to start another one ahead."""
+TRIES = 4
+"""Forecasts, the most valuable first, for which room is looked for in vain before the rest waits for the next time."""
 LEAST_STAY_S = 5.0
 """A container that was started ahead stays for at least so long: a forecast may waver."""
 
@@ -159,22 +161,33 @@ class Planner:
         ready = Counter(each.image for each in view.idle)
         coming = {image: ready[image] + view.starting.get(image, 0) for image in wanted}
         starts: list[Start] = []
-        places = self._settings.starts_at_once - sum(view.starting.values())
         worths: dict[str, float] = {}
-        for image in missing({image: each.count for image, each in wanted.items()}, coming):
-            if len(starts) >= places:
+        places = self._settings.starts_at_once - sum(view.starting.values())
+        sure = missing({image: each.sure for image, each in wanted.items()}, coming)
+        guessed = [image for image in sorted(wanted) if wanted[image].count > max(coming[image], wanted[image].sure)]
+        if places <= 0:
+            sure, guessed = (), []
+        elif guessed and not _fits(view, sum(map(self._size_mb, guessed)), len(guessed)):
+            worths = self._worths(view, guessed, now)
+            guessed.sort(key=lambda image: -worths[_new(image)])
+        failed = 0
+        for image in (*sure, *guessed):
+            if len(starts) >= places or failed >= TRIES:
                 break
             if image in view.blocked:
                 continue
             size_mb = self._size_mb(image)
             slots, needed_mb = _lacking(view, size_mb)
             chosen: tuple[Idle, ...] | None = ()
-            if slots > 0 or needed_mb > 0:
-                worths = worths or self._worths(view, [one for one in wanted if wanted[one].count > coming[one]], now)
+            if (slots > 0 or needed_mb > 0) and coming[image] >= wanted[image].firm:
+                chosen = None
+            elif slots > 0 or needed_mb > 0:
+                worths = worths or self._worths(view, guessed, now)
                 bar = math.inf if coming[image] < wanted[image].sure else worths[_new(image)] * LESS
                 here = [worths[each.id] for each in view.idle]
                 chosen = self._cheaper(view, here, slots, needed_mb, wanted, now, bar=bar)
             if chosen is None:
+                failed += 1
                 continue
             coming[image] += 1
             starts.append(Start(image=image, why=wanted[image].why))
@@ -210,6 +223,8 @@ class Planner:
             for each, worth in zip(view.idle, worths, strict=True)
             if worth < bar and (each.runs or now - each.since >= FRESH_S)
         ]
+        if not open_to:
+            return None
         # What is spared counts all idle ones, also those that are not open to it.
         closed = Counter(each.image for each in view.idle) - Counter(each.image for each, _ in open_to)
         return victims(
@@ -217,7 +232,11 @@ class Planner:
             [worth for _, worth in open_to],
             slots=slots,
             memory_mb=memory_mb,
-            spare={image: each.sure - closed[image] for image, each in wanted.items()},
+            spare={
+                image: wanted[image].sure - closed[image]
+                for image in {each.image for each, _ in open_to}
+                if image in wanted
+            },
         )
 
     def _wanted(self, view: View, now: float) -> dict[str, "_Wanted"]:
@@ -229,25 +248,26 @@ class Planner:
         for image in images:
             busy = view.busy.get(image, 0)
             ahead_s = self._ahead_s(image)
-            count = sure = self._settings.floor.get(image, 0)
+            count = firm = sure = self._settings.floor.get(image, 0)
             why = "floor"
             while count < view.capacity:
-                reason, certain = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
+                reason, surety = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
                 if not reason:
                     break
                 count, why = count + 1, reason
-                sure = count if certain else sure
+                firm = count if surety >= Surety.LESS_WORTH else firm
+                sure = count if surety >= Surety.CERTAIN else sure
             if count:
-                wanted[image] = _Wanted(count, sure, why)
+                wanted[image] = _Wanted(count, firm, sure, why)
         return wanted
 
-    def _wants(self, level: Level, now: float) -> tuple[str, bool]:
-        """Return why a level is wanted, empty when it is not, and whether that is sure: announced, not guessed."""
+    def _wants(self, level: Level, now: float) -> tuple[str, Surety]:
+        """Return why a level is wanted, empty when it is not, and how surely."""
         for forecaster in self._forecasters:
             why = forecaster.wants(level, now)
             if why is not None:
-                return why, forecaster is self._hints
-        return "", False
+                return why, forecaster.surety
+        return "", Surety.SPARE_ROOM
 
     def _ahead_s(self, image: str) -> float:
         return AHEAD * self._costs.of(image) / 1e3 + AHEAD_S
@@ -292,13 +312,19 @@ class _Wanted(Struct, frozen=True):
     """Containers of an image that are wanted beside the busy ones."""
 
     count: int
+    firm: int
+    """Of these, how many may take the place of what is worth less."""
     sure: int
-    """Of these, how many are the floor or announced by a plan, not only forecast."""
+    """Of those, how many are the floor or announced by a plan."""
     why: str
 
 
 def _new(image: str) -> str:
     return f"new {image}"
+
+
+def _fits(view: View, memory_mb: int, containers: int) -> bool:
+    return view.memory_mb + memory_mb <= view.budget_mb and view.containers + containers <= view.capacity
 
 
 def _lacking(view: View, memory_mb: int) -> tuple[int, int]:

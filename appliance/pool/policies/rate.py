@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable
 
 from appliance.pool.policies.demand import Demand
-from appliance.pool.policies.forecaster import Level
+from appliance.pool.policies.forecaster import Level, Surety
 
 MOST = 256
 
@@ -36,6 +36,8 @@ class Rate:
         hit_target: part of the runs that shall find a warm container.
         horizon_s: an image that is asked for less often than this is none of its business.
     """
+
+    surety = Surety.SPARE_ROOM
 
     def __init__(self, demand: Demand, *, hit_target: float, horizon_s: float) -> None:
         self._demand = demand

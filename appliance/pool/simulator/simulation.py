@@ -33,6 +33,8 @@ class Outcome(Struct, frozen=True, kw_only=True):
     local: int
     remote: int
     cold: int
+    cold_s: float
+    """What the cold starts took together."""
     waited: int
     """Runs that had to wait for room; they count as warm or cold as well."""
     lost: int
@@ -145,6 +147,7 @@ class Simulation:
         self._now = 0.0
         self._startups: list[float] = []
         self._counts: Counter[str] = Counter()
+        self._cold_ms = 0.0
         self._wasted_mb_s = 0.0
         self._used_mb_s = 0.0
         self._next_tick = 0.0
@@ -176,6 +179,7 @@ class Simulation:
             local=counts["local"],
             remote=counts["remote"],
             cold=counts["cold"],
+            cold_s=round(self._cold_ms / 1e3, 3),
             waited=counts["waited"],
             lost=sum(len(gateway.waiting) for gateway in self._gateways),
             p50_ms=percentile(ordered, 0.5),
@@ -266,6 +270,7 @@ class Simulation:
             gateway.planner.arrived(image, self._now)
         gateway.busy[image] += 1
         self._counts["cold"] += 1
+        self._cold_ms += container.cold_ms
         self._startups.append(waited_ms + container.cold_ms)
         gateway.costs.add(image, container.cold_ms)
         service_s = arrival.service_s + container.cold_ms / 1e3
