@@ -8,15 +8,18 @@ memory held idle. Figures depend on the seed alone, not on the machine; only `se
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.errors import ConfigError
 from appliance.pool.policies import Evictor
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Outcome, Trace, simulate
 from appliance.pool.simulator.clairvoyant import Belady, least_cold
+from appliance.pool.simulator.recorded import read_trace
 from appliance.pool.simulator.traces import azure, plain
 
 Progress = Callable[[str], None]
@@ -104,19 +107,20 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
     another policy has both fewer cold starts and less waste (beyond 2 % of each, which is within a seed's chance).
     """
     others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT} for each in curve]
-    lines = {
+    return {
         str(mine.budget_mb): {
             "fewer_at_budget": _fewer(mine.cold_percent, theirs.cold_percent),
             "fewer_at_waste": _fewer(mine.cold_percent, cold_at(curves[KEEP_ALIVE], mine.wasted_gb)),
             "on_frontier": not any(
-                each.cold_percent < 0.98 * mine.cold_percent and each.wasted_gb <= mine.wasted_gb * 1.0
-                or each.cold_percent <= mine.cold_percent and each.wasted_gb < 0.98 * mine.wasted_gb
+                (each.cold_percent < 0.98 * mine.cold_percent
+                and each.wasted_gb <= mine.wasted_gb * 1.0)
+                or (each.cold_percent <= mine.cold_percent
+                and each.wasted_gb < 0.98 * mine.wasted_gb)
                 for each in others
             ),
         }
         for mine, theirs in zip(curves[DEFAULT], curves[KEEP_ALIVE], strict=True)
     }
-    return lines
 
 
 def on_trace(trace: Trace, budgets_mb: Sequence[int], progress: Progress = lambda _: None) -> dict[str, Any]:
@@ -186,7 +190,8 @@ def _plain(each: Point) -> dict[str, Any]:
 
 def run(
     *,
-    traces: Sequence[str] = tuple(TRACES),
+    traces: Sequence[str] = (),
+    recorded: Path | None = None,
     budgets_mb: Sequence[int] = BUDGETS_MB,
     gateways: Sequence[int] = (1, 10, 100),
     seed: int = 1,
@@ -195,16 +200,26 @@ def run(
     """Play all policies on traces and return the figures.
 
     Args:
-        traces: names of traces (TRACES).
+        traces: names of generated traces (TRACES); all when none is named and none recorded.
+        recorded: file of a recorded trace.
         budgets_mb: memory budgets of a gateway.
         gateways: numbers of gateways for federated against local.
         seed: of the traces.
         progress: told what is being played.
+
+    Raises:
+        ConfigError: there is no such trace, or the file is none.
     """
+    for name in traces:
+        if name not in TRACES:
+            raise ConfigError(f"no trace {name!r}", remedy=f"known: {', '.join(TRACES)}")
     began = time.perf_counter()
+    played = [TRACES[name](seed) for name in traces or (TRACES if recorded is None else ())]
+    if recorded is not None:
+        played.append(read_trace(recorded))
     result: dict[str, Any] = {
         "seed": seed,
-        "traces": {name: on_trace(TRACES[name](seed), budgets_mb, progress) for name in traces},
+        "traces": {trace.name: on_trace(trace, budgets_mb, progress) for trace in played},
     }
     if gateways:
         result["gateways"] = over_gateways(gateways, seed=seed, budget_mb=2048, progress=progress)

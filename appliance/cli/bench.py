@@ -231,3 +231,36 @@ def dht(
         result["live"] = measure(live.run(nodes=nodes, count=count, progress=console.err.print))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0
+
+
+@bench_app.command
+def policy(
+    *,
+    traces: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
+    trace: Path | None = None,
+    budgets: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (1024, 2048, 4096, 8192),
+    gateways: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (1, 10, 100),
+    seed: int = 1,
+    as_json: Json = False,
+) -> int:
+    """Pool policies on arrival traces, simulated: cold starts against memory held idle, and federated against local.
+
+    Args:
+        traces: azure, poisson, bursts, diurnal, timer; all of them when none is named and no file is given.
+        trace: JSONL file of a recorded trace, one arrival a line.
+        budgets: Memory of a gateway's containers, MB.
+        gateways: Numbers of gateways for federated against local; 0 leaves that out.
+        seed: Of the generated traces.
+    """
+    from appliance.bench.policy import run as bench
+
+    result = bench(
+        traces=traces,
+        recorded=trace,
+        budgets_mb=budgets,
+        gateways=tuple(each for each in gateways if each > 0),
+        seed=seed,
+        progress=console.err.print,
+    )
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0

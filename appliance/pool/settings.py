@@ -104,16 +104,20 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     probe_timeout_s: Positive = 2.0
     probe_failures: Annotated[int, Meta(ge=1)] = 2
     """Pings in a row without answer after which a container is replaced."""
-    eviction: Literal["greedy-dual", "lru", "learned"] = "greedy-dual"
-    """Who is given up when room is needed."""
-    prewarm: tuple[Literal["hints", "histogram", "rate"], ...] = ("hints",)
+    eviction: Literal["greedy-dual", "lru", "learned"] = "learned"
+    """Who is given up when room is needed: `learned` predicts when each is used next, and lets Greedy-Dual decide while
+    it has seen too little or has lately been the worse. In simulation the fewest cold starts of the three
+    (docs/benchmarks.md, Policies)."""
+    prewarm: tuple[Literal["hints", "histogram", "rate"], ...] = ("hints", "histogram")
     """What containers are started ahead for, beside the floor: `hints`: what plans have announced; `histogram`: the
-    idle times of each image say that it is due; `rate`: arrival rate × service time, to `hit_target`."""
+    idle times of an image that is wanted regularly say that it is due; `rate`: arrival rate × service time, to
+    `hit_target`, where there is room."""
     hit_target: Annotated[float, Meta(gt=0, lt=1)] = 0.95
     """Part of the runs of an often used image that shall find a warm container, by `rate`."""
-    keep: Literal["fixed", "histogram", "worth"] = "fixed"
-    """How long an idle container is kept: `fixed`: for `idle_s`; `histogram`: until the 99th percentile of its image's
-    idle times, or not at all before the 5th when that is long; `idle_s` where they say nothing."""
+    keep: Literal["fixed", "histogram", "worth"] = "worth"
+    """How long an idle container is kept while there is room: `fixed`: for `idle_s`; `histogram`: until the 99th
+    percentile of its image's idle times, or not at all before the 5th when that is long; `worth`: while the cold start
+    it saves is worth its memory until it is expected to be used. `idle_s` where they cannot tell."""
     idle_s: Positive = 600.0
     """A ready container beyond the floor that nobody used for so long is removed."""
     max_runs: Annotated[int, Meta(ge=1)] = 200

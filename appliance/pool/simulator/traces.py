@@ -12,19 +12,20 @@ import heapq
 import math
 import random
 from collections.abc import Callable, Iterable, Iterator
+from typing import Annotated
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 DAY_S = 86_400.0
 
 
-class Arrival(Struct, frozen=True, kw_only=True):
+class Arrival(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A run that wants a container."""
 
-    at_s: float
+    at_s: Annotated[float, Meta(ge=0)]
     image: str
-    service_s: float
-    gateway: int = 0
+    service_s: Annotated[float, Meta(ge=0)]
+    gateway: Annotated[int, Meta(ge=0, lt=10_000)] = 0
 
 
 class Image(Struct, frozen=True, kw_only=True):
@@ -123,7 +124,7 @@ def plain(
 
 
 def azure(
-    *, seed: int = 1, images: int = 100, duration_s: float = 8 * 3600.0, gateways: int = 1, most_rate: float = 0.3
+    *, seed: int = 1, images: int = 100, duration_s: float = 8 * 3600.0, gateways: int = 1, most_rate: float = 0.1
 ) -> Trace:
     """Return a trace of the shape of the Azure Functions workload (see the module).
 
