@@ -25,6 +25,7 @@ from appliance.pool.api import (
     Warmed,
 )
 from appliance.pool.keeper import Keeper
+from appliance.pool.policies.hints import OPERATOR
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue
 
@@ -88,7 +89,7 @@ class Verbs:
         if sum(counted) < ask.count and (why := self._keeper.why_no_start(ask.image)):
             self._refused["no room to warm"] += 1
             raise RefusedError(why, remedy="swiftbot pool evict something, raise pool.memory_mb, or wait")
-        self._keeper.hinted(PoolHint(image=ask.image, count=ask.count, keep_s=ask.keep_s, task="operator"))
+        self._keeper.hinted(PoolHint(image=ask.image, count=ask.count, keep_s=ask.keep_s, task=OPERATOR))
         if ask.wait_s:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(ask.wait_s):

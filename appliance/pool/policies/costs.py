@@ -10,12 +10,20 @@ class ColdCosts:
         self._initial_ms = initial_ms
         self._window = window
         self._seen: dict[str, deque[float]] = {}
+        self._costs: dict[str, float] = {}
+        self._usual_ms = initial_ms
 
     def add(self, image: str, took_ms: float) -> None:
         """Note a cold start."""
-        self._seen.setdefault(image, deque(maxlen=self._window)).append(took_ms)
+        seen = self._seen.setdefault(image, deque(maxlen=self._window))
+        seen.append(took_ms)
+        self._costs[image] = sorted(seen)[(3 * len(seen)) // 4]
+        self._usual_ms = sum(self._costs.values()) / len(self._costs)
 
     def of(self, image: str) -> float:
         """Return what a cold start of this image is expected to cost."""
-        seen = sorted(self._seen.get(image, ()))
-        return seen[(3 * len(seen)) // 4] if seen else self._initial_ms
+        return self._costs.get(image, self._initial_ms)
+
+    def usual_ms(self) -> float:
+        """Return the mean over the images that were started here; the initial guess before any was."""
+        return self._usual_ms

@@ -6,6 +6,8 @@ histogram of idle times a level says for the first, second, third … container 
 policies say for the only one.
 """
 
+from collections.abc import Set
+
 from appliance.pool.policies.idle_times import IdleTimes
 
 MAX_IMAGES = 256
@@ -13,6 +15,10 @@ MAX_LEVELS = 16
 """Levels beyond share no histogram: they are left to the rate."""
 FADE = 0.2
 """Weight of the newest in moving averages: about the last nine count."""
+
+
+LOST_S = 60.0
+"""A run that arrived so long ago and has no container waits no longer."""
 
 
 class ImageDemand:
@@ -92,3 +98,10 @@ class Demand:
         found = self.images.get(image)
         if found is not None:
             found.ended(service_s, now)
+
+    def settle(self, present: Set[str], now: float) -> None:
+        """Set right what an end that was never told has left behind: `present` are the images that have runs."""
+        for image, demand in self.images.items():
+            if demand.runs and image not in present and now - demand.last > LOST_S:
+                while demand.runs:
+                    demand.ended(0.0, now)

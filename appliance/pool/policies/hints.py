@@ -9,6 +9,8 @@ from appliance.model import PoolHint
 from appliance.pool.policies.forecaster import Level, Surety
 
 MAX_HINTS = 256
+OPERATOR = "operator"
+"""The `task` of an operator's wish: containers are to be ready, whatever runs come."""
 EARLY_S = 10.0
 """A run of the image counts as the announced one when it comes at most so much before its time."""
 
@@ -39,7 +41,11 @@ class PlanHints:
 
     def arrived(self, image: str, now: float) -> None:
         """Note a run: of a plan's announced needs that are due, the earliest is met."""
-        due = [(hint.at, key) for key, hint in self._hints.items() if key[0] == image and hint.at - EARLY_S <= now]
+        due = [
+            (hint.at, key)
+            for key, hint in self._hints.items()
+            if key[0] == image and key[1] != OPERATOR and hint.at - EARLY_S <= now
+        ]
         if not due:
             return
         _, key = min(due)
@@ -64,7 +70,7 @@ class PlanHints:
             for key, hint in self._hints.items()
             if key[0] == level.image and hint.at - level.ahead_s <= now < hint.until
         )
-        return "a plan will need it" if level.number <= level.busy + due else None
+        return "a plan or an operator will need it" if level.number <= level.busy + due else None
 
     def next_s(self, image: str, now: float) -> float | None:
         """Return in how many seconds the next announced need of this image is; None: none is."""

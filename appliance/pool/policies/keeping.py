@@ -2,11 +2,11 @@
 
 from typing import Protocol
 
+from appliance.pool.policies.costs import ColdCosts
 from appliance.pool.policies.facts import Idle
 from appliance.pool.policies.forecaster import Level
 from appliance.pool.policies.histogram import Histogram
 from appliance.pool.policies.learned import Learned
-from appliance.pool.settings import PoolConfig
 
 
 class Keeping(Protocol):
@@ -45,16 +45,25 @@ class KeepHistogram:
 class KeepWorth:
     """For as long as it is worth its memory: a small one that is dear to start waits longer than a large cheap one.
 
-    One of usual size and start cost (pool.container_memory_mb, pool.cold_ms) is kept while it is expected to be used
-    within `idle_s`; one of twice the memory within half of it. Where the learned policy does not trust its
+    One of usual size (pool.container_memory_mb) and usual start cost (the mean here) is kept while it is expected to be
+    used within `idle_s`; one of twice the memory within half of it. Where the learned policy does not trust its
     predictions, the fixed time counts. A level whose idle times say that it is not due for a while rests.
     """
 
-    def __init__(self, learned: Learned, histogram: Histogram | None, settings: PoolConfig, otherwise: Keeping) -> None:
+    def __init__(
+        self,
+        learned: Learned,
+        histogram: Histogram | None,
+        costs: ColdCosts,
+        *,
+        usual_mb: int,
+        idle_s: float,
+    ) -> None:
         self._learned = learned
         self._histogram = histogram
-        self._price = settings.cold_ms / (settings.container_memory_mb * settings.idle_s)
-        self._otherwise = otherwise
+        self._costs = costs
+        self._usual_mb_s = usual_mb * idle_s
+        self._otherwise = KeepFixed(idle_s)
 
     def rests(self, idle: Idle, level: Level, now: float) -> str:
         """Give up what is worth less than its memory."""
@@ -63,6 +72,6 @@ class KeepWorth:
         wait_s = self._learned.wait_s(idle, level.number, now)
         if wait_s is None:
             return self._otherwise.rests(idle, level, now)
-        if idle.cold_ms / (idle.memory_mb * wait_s) >= self._price:
+        if idle.cold_ms * self._usual_mb_s >= self._costs.usual_ms() * idle.memory_mb * wait_s:
             return ""
         return f"not expected to be used for {wait_s:.0f} s"

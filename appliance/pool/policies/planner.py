@@ -86,7 +86,9 @@ class Planner:
         kinds: dict[str, Keeping] = {
             "fixed": fixed,
             "histogram": KeepHistogram(histogram, fixed),
-            "worth": KeepWorth(self._learned, sharp, settings, fixed),
+            "worth": KeepWorth(
+                self._learned, sharp, costs, usual_mb=settings.container_memory_mb, idle_s=settings.idle_s
+            ),
         }
         self._keeping = kinds[settings.keep]
         self._learns = settings.keep == "worth" or settings.eviction == "learned"
@@ -104,6 +106,8 @@ class Planner:
         self._demand.arrived(image, now)
         self._hints.arrived(image, now)
         self._evictor.arrived(image, now)
+        if self._learns and self._evictor is not self._learned:
+            self._learned.arrived(image, now)
 
     def ended(self, image: str, service_s: float, now: float) -> None:
         """Note that a run that had arrived is over, having had its container for `service_s` (0: it had none)."""
@@ -149,6 +153,7 @@ class Planner:
 
     def tend(self, view: View, now: float) -> tuple[tuple[Start, ...], tuple[Retire, ...]]:
         """Return what to start ahead and what to give up, to be carried out together, retirements first."""
+        self._demand.settle({image for counts in (view.busy, view.starting) for image in counts if counts[image]}, now)
         if self._learns:
             self._learned.observed(view.idle, now)
         wanted = self._wanted(view, now)
