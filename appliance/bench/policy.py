@@ -59,6 +59,8 @@ class Point(Struct, frozen=True, kw_only=True):
     cold_percent: float
     wasted_gb: float
     """Memory held idle, on average over the trace."""
+    cold_ms_per_run: float
+    """What runs waited for cold starts, on average over all of them."""
     p99_ms: float
     evictions: int
     prewarmed: int
@@ -71,6 +73,7 @@ def point(trace: Trace, budget_mb: int, outcome: Outcome) -> Point:
         budget_mb=budget_mb,
         cold_percent=round(100 * outcome.cold_rate, 3),
         wasted_gb=round(outcome.wasted_gb_s / trace.duration_s, 4),
+        cold_ms_per_run=round(1e3 * outcome.cold_s / max(1, outcome.runs), 2),
         p99_ms=round(outcome.p99_ms, 1),
         evictions=outcome.evictions,
         prewarmed=outcome.prewarmed,
@@ -112,10 +115,8 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
             "fewer_at_budget": _fewer(mine.cold_percent, theirs.cold_percent),
             "fewer_at_waste": _fewer(mine.cold_percent, cold_at(curves[KEEP_ALIVE], mine.wasted_gb)),
             "on_frontier": not any(
-                (each.cold_percent < 0.98 * mine.cold_percent
-                and each.wasted_gb <= mine.wasted_gb * 1.0)
-                or (each.cold_percent <= mine.cold_percent
-                and each.wasted_gb < 0.98 * mine.wasted_gb)
+                (each.cold_percent < 0.98 * mine.cold_percent and each.wasted_gb <= mine.wasted_gb * 1.0)
+                or (each.cold_percent <= mine.cold_percent and each.wasted_gb < 0.98 * mine.wasted_gb)
                 for each in others
             ),
         }
@@ -153,7 +154,12 @@ def on_trace(trace: Trace, budgets_mb: Sequence[int], progress: Progress = lambd
 
 
 def over_gateways(
-    counts: Sequence[int], *, seed: int, budget_mb: int, progress: Progress = lambda _: None
+    counts: Sequence[int],
+    *,
+    seed: int,
+    budget_mb: int,
+    duration_s: float = 7200.0,
+    progress: Progress = lambda _: None,
 ) -> dict[str, Any]:
     """Return cold, local and federated pools with the default policies at so many gateways.
 
@@ -164,7 +170,7 @@ def over_gateways(
     chosen = policies()
     for count in counts:
         progress(f"{count} gateways")
-        trace = plain("poisson", seed=seed, images=24, rate=0.05 * count, duration_s=7200.0, gateways=count)
+        trace = plain("poisson", seed=seed, images=24, rate=0.05 * count, duration_s=duration_s, gateways=count)
         lines: dict[str, Any] = {"runs": len(trace.arrivals)}
         for name, policy, mode in (
             ("cold", DEFAULT, "cold"),

@@ -41,7 +41,7 @@ class ImageDemand:
     def arrived(self, now: float) -> None:
         """Note a run that begins or wants to."""
         if self.arrivals:
-            gap_s = now - self.last
+            gap_s = max(0.0, now - self.last)
             self._gap_s = gap_s if self.arrivals == 1 else self._gap_s + FADE * (gap_s - self._gap_s)
         self.arrivals += 1
         self.last = now

@@ -199,7 +199,7 @@ class Learned:
             1.0,
             math.log(gap_s * level + 0.1),
             math.log(usual_s + 0.1) if usual_s else math.log(gap_s * level + 0.1),
-            math.log(idle_s + 1.0),
+            math.log(max(0.0, idle_s) + 1.0),
             1.0 if usual_s else 0.0,
             math.log(idle.cold_ms / 500.0),
             math.log(idle.memory_mb / 256.0),

@@ -1,0 +1,53 @@
+"""The benchmark of pool policies: its comparisons are right, and a small one runs to the end."""
+
+import pytest
+
+from appliance.bench.policy import DEFAULT, KEEP_ALIVE, Point, cold_at, compare, over_gateways, run
+from appliance.errors import ConfigError
+
+
+def point(budget_mb: int, cold_percent: float, wasted_gb: float) -> Point:
+    """A point of a curve."""
+    return Point(
+        budget_mb=budget_mb,
+        cold_percent=cold_percent,
+        wasted_gb=wasted_gb,
+        cold_ms_per_run=0.0,
+        p99_ms=0.0,
+        evictions=0,
+        prewarmed=0,
+        unused=0,
+    )
+
+
+def test_a_curve_between_and_beyond_its_points() -> None:
+    """Linear between points; never better than its best nor cheaper than its cheapest."""
+    curve = [point(1, 40.0, 1.0), point(2, 20.0, 2.0)]
+    assert cold_at(curve, 1.5) == 30.0
+    assert cold_at(curve, 0.1) == 40.0
+    assert cold_at(curve, 9.0) == 20.0
+
+
+def test_how_the_default_stands() -> None:
+    """Fewer cold starts at equal budget and at equal waste, and whether another policy is better in both."""
+    curves = {
+        DEFAULT: [point(1, 20.0, 1.0), point(2, 10.0, 2.0)],
+        KEEP_ALIVE: [point(1, 40.0, 1.0), point(2, 20.0, 3.0)],
+        "other": [point(1, 25.0, 1.0), point(2, 8.0, 1.9)],
+    }
+    stands = compare(curves)
+    assert stands["1"] == {"fewer_at_budget": 50.0, "fewer_at_waste": 50.0, "on_frontier": True}
+    assert stands["2"] == {"fewer_at_budget": 50.0, "fewer_at_waste": 66.7, "on_frontier": False}
+
+
+def test_other_gateways_spare_cold_starts() -> None:
+    """With the same policies and load, a federated pool starts fewer containers cold than a local one."""
+    stands = over_gateways((3,), seed=1, budget_mb=1024, duration_s=1800.0)["3"]
+    assert stands["cold"]["cold_percent"] == 100.0
+    assert stands["federated"]["cold_percent"] < 0.7 * stands["local"]["cold_percent"]
+
+
+def test_an_unknown_trace_is_refused() -> None:
+    """The message names those that are known."""
+    with pytest.raises(ConfigError, match="nonsense"):
+        run(traces=("nonsense",))
