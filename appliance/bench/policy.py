@@ -107,7 +107,7 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
 
     At each budget: `fewer_at_budget`, percent fewer cold starts than keep-alive with the same budget;
     `fewer_at_waste`, the same against keep-alive's curve where it wastes as much; `on_frontier`, whether no point of
-    another policy has both fewer cold starts and less waste (beyond 2 % of each, which is within a seed's chance).
+    another policy is better by 5 % in one of the two at no more than 2 % worse in the other.
     """
     others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT} for each in curve]
     return {
@@ -115,8 +115,8 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
             "fewer_at_budget": _fewer(mine.cold_percent, theirs.cold_percent),
             "fewer_at_waste": _fewer(mine.cold_percent, cold_at(curves[KEEP_ALIVE], mine.wasted_gb)),
             "on_frontier": not any(
-                (each.cold_percent < 0.98 * mine.cold_percent and each.wasted_gb <= mine.wasted_gb * 1.0)
-                or (each.cold_percent <= mine.cold_percent and each.wasted_gb < 0.98 * mine.wasted_gb)
+                (each.cold_percent < 0.95 * mine.cold_percent and each.wasted_gb <= 1.02 * mine.wasted_gb)
+                or (each.cold_percent <= 1.02 * mine.cold_percent and each.wasted_gb < 0.95 * mine.wasted_gb)
                 for each in others
             ),
         }
