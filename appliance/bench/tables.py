@@ -15,7 +15,7 @@ def markdown(result: Mapping[str, Any]) -> str:
     parts: list[str] = []
     rest: list[Row] = []
     rows: list[Row] = []
-    for name, value in _flat(result):
+    for name, value in _flat(_by_heap(result)):
         if isinstance(value, Mapping) and "count" in value:
             rows.append((f"`{name}`", *(_figure(value.get(key)) for key in ("count", "p50", "p90", "p99", "max"))))  # pyright: ignore[reportUnknownMemberType]
         else:
@@ -55,6 +55,13 @@ def _ladder(ladder: Mapping[str, Any]) -> str:
         ending = f"Breaks at {broke['breaks']:g}/s: {'; '.join(broke['why'])}."
     header = ("runs/s", "count", "p50 ms", "p90 ms", "p99 ms", "unserved", "phases", "CPU")
     return f"{title}:\n\n{table(header, rows)}\n\n{ending}"
+
+
+def _by_heap(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result with its heaps by name instead of in a list."""
+    heaps = {f"{each['size_mb']} MB of {each['kind']}": each for each in result.get("heaps", ())}
+    parts = {name: {key: heap[key] for key in heap if key not in ("size_mb", "kind")} for name, heap in heaps.items()}
+    return {key: value for key, value in result.items() if key != "heaps"} | parts
 
 
 _APART = frozenset({"cdf", "ladders", "census", "checkpoints"})

@@ -127,6 +127,41 @@ def refill(
 
 
 @bench_app.command
+def zygote(
+    *,
+    count: int = 200,
+    sizes_mb: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (0, 50, 200),
+    image: str = "base",
+    as_json: Json = False,
+) -> int:
+    """What a large preloaded heap costs at a start: forks of a zygote that holds it, beside a plain process.
+
+    Args:
+        count: Runs of each kind of start and heap.
+        sizes_mb: Sizes of the heap.
+        image: Image of the containers.
+    """
+    from appliance.bench.zygote import run
+
+    tell(measure(run(count, sizes_mb, image=image, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
+def transfer(*, megabytes: int = 64, rounds: int = 3, as_json: Json = False) -> int:
+    """How long a state volume takes from gateway to gateway, beside Podman's own export and import.
+
+    Args:
+        megabytes: Size of the volume.
+        rounds: Rounds of each way; the median counts.
+    """
+    from appliance.bench.transfer import run
+
+    tell(measure(run(megabytes, rounds, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
 def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: int = 1, as_json: Json = False) -> int:
     """Thousands of subtasks through one gateway, some of which misbehave: counts before and after, leaks, memory.
 

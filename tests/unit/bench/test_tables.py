@@ -34,6 +34,13 @@ def test_a_ladder_says_where_it_broke() -> None:
     assert text.endswith("Carried to 5/s, the highest rate offered.\n")
 
 
+def test_heaps_are_named_by_size_and_kind() -> None:
+    """A row for each kind of start, and what is no distribution below."""
+    text = markdown({"heaps": [{"kind": "objects", "size_mb": 200, "fork": SUMMARY, "rss_mb": 210.5}]})
+    assert "| `200 MB of objects.fork` | 3 | 1.23 | 20.0 | – | 1,234.6 |" in text
+    assert text.endswith("- `200 MB of objects.rss_mb`: 210.5\n")
+
+
 def test_a_census_shows_before_and_after() -> None:
     """Counts side by side; a pipe within a cell does not end it."""
     text = markdown({"census": {"before": {"a|b": 1}, "after": {"a|b": 2}}})
