@@ -25,6 +25,7 @@ from appliance.pool.conversation import order
 from appliance.pool.engine import EngineFacts, PodmanEngine, remove_fleet
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
+from appliance.pool.state import ALONE
 from appliance.skills.catalogue import load_catalogue
 
 KINDS = ("objects", "buffers")
@@ -106,6 +107,7 @@ async def _container(handler: str, size_mb: int, count: int, image: str, config:
                 catalogue=load_catalogue([write_skill(Path(folder), image, handler=handler, more=more)]),
                 site={},
                 on_death=lambda _: None,
+                state=ALONE,
             )
             container = starter.new(image)
             facts: EngineFacts = await engine.facts()
