@@ -28,6 +28,7 @@ from appliance.pool.api import (
     WarmAsk,
     Warmed,
 )
+from appliance.pool.transfer.api import Brought, FetchAsk
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 
 R = TypeVar("R", bound=Struct)
@@ -131,6 +132,21 @@ class FleetClient:
         """Have a gateway keep containers of an image ready."""
         await self._known(gateway)
         return await self.plane.rpc.call(gateway, "pool_warm", ask, Warmed, timeout_s=ask.wait_s + 5.0)
+
+    async def image_fetch(self, gateway: str, reference: str, source: str = "", *, timeout_s: float = 900.0) -> Brought:
+        """Have a gateway bring an image to itself, from `source` first; returns when it is there.
+
+        Raises:
+            NotFoundError: no gateway that answers has it.
+        """
+        await self._known(gateway)
+        ask = FetchAsk(reference=reference, gateway=source)
+        return await self.plane.rpc.call(gateway, "image_fetch", ask, Brought, timeout_s=timeout_s)
+
+    def image_holders(self, reference: str) -> tuple[str, ...]:
+        """Gateways whose status lists an image, by its full reference."""
+        known = self.plane.registry.gateways
+        return tuple(sorted(each for each, status in known.items() if reference in status.images))
 
     async def pool_evict(self, name: str, gateway: str = "") -> dict[str, Evicted]:
         """Give up a container, by its id or the beginning of it, or all idle ones of an image; answers by gateway.

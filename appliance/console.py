@@ -28,6 +28,7 @@ from appliance.model import (
 )
 from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
+from appliance.pool.transfer.api import Brought
 from appliance.record.facts import LogInfo
 from appliance.tasks.replay import ReplayReport
 from appliance.tasks.why import AttemptWhy, TaskWhy
@@ -374,15 +375,24 @@ def log_summary(found: LogInfo) -> Group:
     return Group(head, *notes, table)
 
 
-def image_table(images: Sequence[ImageState]) -> Table:
-    """Images of the catalogue, a line each."""
+def image_table(images: Sequence[ImageState], *, gateways: bool = False) -> Table:
+    """Images of the catalogue, a line each; with the gateways that have it where a fleet was asked."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
-    for name in ("image", "reference", "state", "size"):
+    for name in ("image", "reference", "state", "size", *(["gateways"] if gateways else [])):
         table.add_column(name, overflow="fold")
     for each in images:
         size = f"{each.size_bytes / 2**20:.0f} MiB" if each.size_bytes else "–"
-        table.add_row(each.name, each.reference, "built" if each.present else "not built", size)
+        holders = [", ".join(each.gateways) or "none"] if gateways else []
+        table.add_row(each.name, each.reference, "built" if each.present else "not built", size, *holders)
     return table
+
+
+def brought_text(brought: Brought, target: str) -> str:
+    """What a transfer did, in a line."""
+    if not brought.gateway:
+        return f"{brought.what} is on {target} already"
+    moved = f"{brought.wire_bytes / 2**20:.1f} MiB over the network in {brought.duration_ms / 1e3:.1f} s"
+    return f"{brought.what} came to {target} from {brought.gateway}: {moved}"
 
 
 def check_table(checks: Sequence[Check]) -> Group:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import TOOLS, Json, show
+from appliance.cli.common import HERE, TOOLS, Json, Where, show
 from appliance.errors import ConfigError
 
 log_app = App(name="log", help="Look into MCAP logs and replay them.", group=TOOLS)
@@ -182,13 +182,67 @@ def images_build(names: tuple[str, ...] = (), *, force: Annotated[bool, Paramete
 
 
 @images_app.command(name="list")
-def images_list(*, as_json: Json = False) -> int:
-    """List the images of the catalogue and whether they are built."""
+def images_list(
+    *, gateways: Annotated[bool, Parameter(negative="")] = False, as_json: Json = False, where: Where = HERE
+) -> int:
+    """List the images of the catalogue and whether they are built.
+
+    Args:
+        gateways: Ask a fleet which of its gateways have each.
+        as_json: Print JSON.
+        where: The fleet, if it is asked.
+    """
+    from msgspec.structs import replace
+
+    from appliance.client import FleetClient
     from appliance.pool.images import list_images
     from appliance.skills.catalogue import load_catalogue
 
-    found = asyncio.run(list_images(load_catalogue()))
-    show(found, as_json=as_json, table=console.image_table(found))
+    async def go() -> None:
+        found = await list_images(load_catalogue())
+        if gateways:
+            async with FleetClient(where.endpoint()) as client:
+                await client.gateway()
+                found = [replace(each, gateways=client.image_holders(each.reference)) for each in found]
+        show(found, as_json=as_json, table=console.image_table(found, gateways=gateways))
+
+    asyncio.run(go())
+    return 0
+
+
+@images_app.command(name="fetch")
+def images_fetch(
+    name: str,
+    *,
+    source: Annotated[str, Parameter(name="--from", help="Gateway to ask first; any that has it otherwise.")] = "",
+    gateway: Annotated[str, Parameter(help="Gateway that fetches it; the one that is linked to otherwise.")] = "",
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Have a gateway fetch an image from another: only the layers that it lacks, without a registry.
+
+    Args:
+        name: An image of the catalogue, such as base, or a full reference.
+        source: Gateway to ask first.
+        gateway: Gateway that fetches it.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+    from appliance.client import FleetClient
+    from appliance.pool.images import reference
+    from appliance.pool.settings import PoolConfig
+    from appliance.skills.catalogue import load_catalogue
+
+    spec = load_catalogue().images.get(name)
+    full = name if spec is None else reference(spec, PoolConfig())
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            target = gateway or await client.gateway()
+            found = await client.image_fetch(target, full, source)
+        show(found, as_json=as_json, table=console.brought_text(found, target))
+
+    asyncio.run(go())
     return 0
 
 

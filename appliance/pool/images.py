@@ -41,6 +41,8 @@ class ImageState(Struct, frozen=True, kw_only=True):
     reference: str
     present: bool
     size_bytes: int = 0
+    gateways: tuple[str, ...] = ()
+    """Gateways of a fleet that have it, where the fleet was asked."""
 
 
 def base_image(config: PoolConfig) -> str:

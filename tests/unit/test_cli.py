@@ -9,8 +9,8 @@ from appliance import cli
 COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "fleet",
     "pool", "robots list", "robots qgc-actions", "log info", "log replay", "log recover",
-    "log merge", "log trim", "log cat", "log pin", "sim mavlink", "sim zenoh", "images build", "images list", "doctor",
-    "tui", "bench startup", "bench rate", "bench refill", "bench soak", "bench zygote",
+    "log merge", "log trim", "log cat", "log pin", "sim mavlink", "sim zenoh", "images build", "images list",
+    "images fetch", "doctor", "tui", "bench startup", "bench rate", "bench refill", "bench soak", "bench zygote",
     "bench table", "pool list", "pool why", "pool warm", "pool evict", "pool release", "pool decisions",
 ]  # fmt: skip
 

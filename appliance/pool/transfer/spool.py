@@ -27,7 +27,7 @@ class Arrival:
         self.path = folder / "data"
         self._have: set[int] = set()
         self._marks = folder / "have"
-        self._file = -1
+        self._file = self._marks_file = -1
         self._lock = threading.Lock()
         """A chunk may still be written when whoever waited for it has been cancelled."""
 
@@ -65,21 +65,19 @@ class Arrival:
                 # Its whole room at once: a disk that is too full says so before anything was moved.
                 os.posix_fallocate(self._file, 0, self.manifest.size_bytes)
                 os.truncate(self._file, self.manifest.size_bytes)
+            said = self._marks.read_bytes() if self._marks.exists() else b""
+            for index in range(min(len(said), self.manifest.count)):
+                if said[index] == 1 and self._is_right(index):
+                    self._have.add(index)
+            self._marks.write_bytes(bytes(index in self._have for index in range(self.manifest.count)))
+            self._marks_file = os.open(self._marks, os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
             self.remove()
             raise no_room(error, self.what) from error
-        said = self._marks.read_bytes() if self._marks.exists() else b""
-        for index in range(min(len(said), self.manifest.count)):
-            if said[index] == 1 and self._is_right(index):
-                self._have.add(index)
-        self._mark_all()
 
     def _is_right(self, index: int) -> bool:
         offset, length = self.manifest.span(index)
         return hashlib.sha256(os.pread(self._file, length, offset)).digest() == self.manifest.chunk(index)
-
-    def _mark_all(self) -> None:
-        self._marks.write_bytes(bytes(index in self._have for index in range(self.manifest.count)))
 
     def put(self, index: int, data: bytes) -> None:
         """Keep a chunk, if it is what was announced.
@@ -99,9 +97,7 @@ class Arrival:
     def _keep(self, index: int, data: bytes, offset: int) -> None:
         try:
             self._write(data, offset)
-            with self._marks.open("r+b") as marks:
-                marks.seek(index)
-                marks.write(b"\x01")
+            os.pwrite(self._marks_file, b"\x01", index)
         except OSError as error:
             if error.errno in FULL:
                 self._end()
@@ -133,9 +129,10 @@ class Arrival:
             self._end()
 
     def _end(self) -> None:
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
+        for handle in (self._file, self._marks_file):
+            if handle >= 0:
+                os.close(handle)
+        self._file = self._marks_file = -1
 
     def remove(self) -> None:
         """Remove all of it."""

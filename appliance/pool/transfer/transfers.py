@@ -346,11 +346,15 @@ class Transfers:
 
     def bandwidth_mbps(self, gateway: str) -> float:
         """Megabits per second measured with a gateway (moving average); a careful guess before there is any."""
-        return self._fetcher.links.get(gateway, Link()).bandwidth * 8 / 1e6
+        return self.link(gateway).bandwidth * 8 / 1e6
 
     def cost_ms(self, size_bytes: int, gateway: str) -> float:
         """MigCost without the start: size / bandwidth + serialise + deserialise, ms (algorithms, Phase 2)."""
-        return self._fetcher.links.get(gateway, Link()).cost_ms(size_bytes)
+        return self.link(gateway).cost_ms(size_bytes)
+
+    def link(self, gateway: str) -> Link:
+        """All that was measured of moving state from a gateway."""
+        return self._fetcher.links.get(gateway, Link())
 
     # --- watching ---------------------------------------------------------------------------------------------
 
