@@ -1,0 +1,108 @@
+"""What is known of containers and state elsewhere: whose word counts, what is out of date, what things cost."""
+
+from typing import Any
+
+import pytest
+
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, VolumeInfo
+from appliance.tasks.api import ContainerList
+from appliance.tasks.remote import BRING_MS, EMPTY_OFFERS, LEFT_OUT_S, RemoteContainers, UnmeasuredLinks
+
+pytestmark = pytest.mark.anyio
+
+NEED = Need(image="base", volumes=("maps", "fresh"))
+READY, BUSY = ContainerState.READY, ContainerState.BUSY
+
+
+def container(gateway: str, name: str, state: ContainerState = READY, **fields: Any) -> ContainerInfo:
+    """Return a container."""
+    return ContainerInfo(**{"id": name, "gateway": gateway, "image": "base", "state": state, **fields})
+
+
+@pytest.fixture
+def remote(plane: Any) -> RemoteContainers:
+    """Return what gw-1 knows of gw-2, gw-3 (asked) and gw-4 (heard of)."""
+    plane.present = {"gw-1", "gw-2", "gw-3", "gw-4"}
+    return RemoteContainers(plane, successors=3, links=UnmeasuredLinks())
+
+
+def know(plane: Any, *containers: ContainerInfo) -> None:
+    """Have heard of containers."""
+    for each in containers:
+        plane.registry.containers.setdefault(each.gateway, {})[each.id] = each
+
+
+def answers(plane: Any, **by_gateway: tuple[ContainerInfo, ...]) -> None:
+    """What gateways answer when asked; the others do not."""
+
+    async def find(gateway: str, need: Need) -> ContainerList:
+        return ContainerList(containers=by_gateway[gateway.replace("-", "_")])
+
+    plane.rpc.on["find_containers"] = find
+
+
+async def found(remote: RemoteContainers) -> dict[str, ContainerState]:
+    """Look, and return what was found, by id."""
+    return {each.container.id: each.container.state for each in await remote.find(NEED)}
+
+
+async def test_a_gateways_own_word_is_newer_than_what_was_heard(remote: RemoteContainers, plane: Any) -> None:
+    """A ready one that its gateway does not name is gone; hearsay of one that was asked itself does not count."""
+    know(plane, container("gw-2", "old"), container("gw-2", "works", BUSY), container("gw-4", "heard"))
+    answers(
+        plane,
+        gw_2=(container("gw-2", "new"), container("gw-3", "rumour"), container("gw-4", "heard", BUSY)),
+        gw_3=(container("gw-4", "more"),),
+    )
+    assert await found(remote) == {"works": BUSY, "new": READY, "heard": READY, "more": READY}
+
+
+async def test_those_that_do_not_answer_are_known_by_what_was_heard(remote: RemoteContainers, plane: Any) -> None:
+    """Without an answer the registry counts; what is here, of nobody, or of another image does not."""
+    know(
+        plane,
+        container("gw-2", "a"),
+        container("gw-1", "here"),
+        container("gw-9", "gone"),
+        container("gw-2", "other", image="vision"),
+        container("gw-3", "also", image="vision", compatible=("base",)),
+    )
+    assert await found(remote) == {"a": READY, "also": READY}
+    assert {each.id for each in (await remote.answer(NEED)).containers} >= {"a", "here"}
+    know(plane, container("gw-2", "a", BUSY))
+    assert "a" not in {each.id for each in (await remote.answer(NEED)).containers}
+
+
+async def test_state_is_where_its_newest_generation_is(remote: RemoteContainers, plane: Any) -> None:
+    """Several may hold it; an older one, one of a lost gateway and one told by somebody else do not count."""
+
+    def volume(gateway: str, generation: int) -> VolumeInfo:
+        return VolumeInfo(name="maps", gateway=gateway, generation=generation, size_bytes=12_500_000)
+
+    for gateway, volumes in {
+        "gw-1": (volume("gw-1", 2),),
+        "gw-2": (volume("gw-2", 3),),
+        "gw-3": (volume("gw-3", 3), volume("gw-4", 8)),
+        "gw-9": (volume("gw-9", 9),),
+    }.items():
+        plane.registry.gateways[gateway] = GatewayStatus(id=gateway, fleet="f", volumes=volumes)
+    facts = remote.facts(NEED)
+    assert set(facts.volumes) == {"maps"}
+    assert [each.gateway for each in facts.volumes["maps"]] == ["gw-2", "gw-3"]
+    # 12.5 MB at a guess of 12.5 MB/s, and 200 MB/s to pack and to unpack.
+    assert facts.files_ms(12_500_000, "gw-2") == pytest.approx(1000)
+    assert facts.state_ms(12_500_000, "gw-2") == pytest.approx(BRING_MS + 5 + 1000 + 2 * 62.5)
+
+
+async def test_empty_offers_leave_a_gateway_out_for_a_while(remote: RemoteContainers, plane: Any) -> None:
+    """The clock is passed in; a good offer, and the gateway's going, end it."""
+    now = 100.0
+    for _ in range(EMPTY_OFFERS - 1):
+        remote.turned_out("gw-2", good=False, now=lambda: now)
+    assert remote.left_out(lambda: now) == {}
+    remote.turned_out("gw-2", good=False, now=lambda: now)
+    assert set(remote.left_out(lambda: now)) == {"gw-2"}
+    assert remote.left_out(lambda: now + LEFT_OUT_S) == {}
+    for callback in plane.on_member_lost:
+        callback("gw-2")
+    assert remote.left_out(lambda: now) == {}
