@@ -6,6 +6,7 @@ words of its plan's parameters, are blanked: equal skeletons are one sentence wi
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 from appliance.llm.corpus.check import stem
@@ -56,19 +57,27 @@ def too_near(
         others: a test set, laid out alike.
     """
     frames: dict[tuple[str, ...], str] = {}
-    bags: list[tuple[str, frozenset[str]]] = []
+    bags: defaultdict[int, list[tuple[str, frozenset[str]]]] = defaultdict(list)
     for name, (instruction, subtasks) in (others or {}).items():
         frames.setdefault(skeleton(instruction, subtasks), name)
-        bags.append((name, words(instruction)))
+        bag = words(instruction)
+        bags[len(bag)].append((name, bag))
     for name, (instruction, subtasks) in pairs.items():
         frame, bag = skeleton(instruction, subtasks), words(instruction)
         if sum(word != "_" and word not in _STOP for word in frame) >= LITERAL and frame in frames:
             yield f"{name}: the same sentence as {frames[frame]} with other nouns"
-        for other, there in bags:
-            shared = len(bag & there)
-            if (bag and bag == there) or (shared >= 3 and shared >= SHARED * len(bag | there)):
-                yield f"{name}: has most words in common with {other}"
-                break
+        if other := _most_words(bag, bags):
+            yield f"{name}: has most words in common with {other}"
         if others is None:
             frames.setdefault(frame, name)
-            bags.append((name, bag))
+            bags[len(bag)].append((name, bag))
+
+
+def _most_words(bag: frozenset[str], bags: Mapping[int, Sequence[tuple[str, frozenset[str]]]]) -> str:
+    """Return the first of `bags` (by their size) that is too near; sets of very different size cannot be."""
+    for size in range(int(SHARED * len(bag)), int(len(bag) / SHARED) + 1):
+        for other, there in bags.get(size, ()):
+            shared = len(bag & there)
+            if (bag and bag == there) or (shared >= 3 and shared >= SHARED * len(bag | there)):
+                return other
+    return ""

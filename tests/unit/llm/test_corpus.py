@@ -17,8 +17,8 @@ from appliance.llm.corpus.tally import tally
 from appliance.model import Subtask
 from appliance.skills.catalogue import DOMAINS, Catalogue
 
-LEAST_OF_A_SKILL = 9
-LEAST_OF_A_DOMAIN = 20
+LEAST_OF_A_SKILL = 15
+LEAST_OF_A_DOMAIN = 50
 
 _LINE = st.text(st.characters(blacklist_categories=("Cc", "Cs"), blacklist_characters="\u2028\u2029"), max_size=30)
 _NAME = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
@@ -61,7 +61,7 @@ def corpus() -> dict[str, Pair]:
 
 
 @given(st.lists(_PAIR, max_size=3))
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_what_is_written_is_read_as_the_same_pairs(pairs: list[Pair]) -> None:
     """Any pair survives the notation, whatever its texts contain."""
     assert list(parse(write(pairs)).values()) == pairs
