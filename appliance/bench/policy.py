@@ -14,12 +14,12 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.bench.fleet_trace import read_any
 from appliance.errors import ConfigError
 from appliance.pool.policies import Evictor
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Outcome, Trace, simulate
 from appliance.pool.simulator.clairvoyant import Belady, least_cold
-from appliance.pool.simulator.recorded import read_trace
 from appliance.pool.simulator.traces import azure, plain
 
 Progress = Callable[[str], None]
@@ -29,6 +29,8 @@ FOREVER_S = 1e9
 DEFAULT = "default"
 KEEP_ALIVE = "keep-alive"
 CLAIRVOYANT = "clairvoyant"
+TICKS = 17_280
+"""The pools are gone through so often over a trace, but at most once a second: for a day every 5 s."""
 TRACES: dict[str, Callable[[int], Trace]] = {
     "azure": lambda seed: azure(seed=seed),
     "poisson": lambda seed: plain("poisson", seed=seed, rate=0.5),
@@ -128,10 +130,12 @@ def on_trace(trace: Trace, budgets_mb: Sequence[int], progress: Progress = lambd
     """Return every policy's curve on one trace, the clairvoyant ones beside them, and how the default stands."""
     chosen = policies()
     curves: dict[str, list[Point]] = {}
+    tick_s = max(1.0, trace.duration_s / TICKS)
     for name, settings in chosen.items():
         progress(f"{trace.name}: {name}")
         curves[name] = [
-            point(trace, budget, simulate(trace, replace(settings, memory_mb=budget))) for budget in budgets_mb
+            point(trace, budget, simulate(trace, replace(settings, memory_mb=budget), tick_s=tick_s))
+            for budget in budgets_mb
         ]
 
     def crystal_ball(gateway: int) -> Evictor:
@@ -139,7 +143,9 @@ def on_trace(trace: Trace, budgets_mb: Sequence[int], progress: Progress = lambd
 
     ideal = chosen["greedy-dual"]
     curves[CLAIRVOYANT] = [
-        point(trace, budget, simulate(trace, replace(ideal, memory_mb=budget), make_evictor=crystal_ball))
+        point(
+            trace, budget, simulate(trace, replace(ideal, memory_mb=budget), tick_s=tick_s, make_evictor=crystal_ball)
+        )
         for budget in budgets_mb
     ]
     bound = least_cold(trace, [each.wasted_gb * 1024 * trace.duration_s for each in curves[DEFAULT]])
@@ -207,7 +213,7 @@ def run(
 
     Args:
         traces: names of generated traces (TRACES); all when none is named and none recorded.
-        recorded: file of a recorded trace.
+        recorded: file of a recorded trace, JSONL or a fleet's MCAP log.
         budgets_mb: memory budgets of a gateway.
         gateways: numbers of gateways for federated against local.
         seed: of the traces.
@@ -222,7 +228,7 @@ def run(
     began = time.perf_counter()
     played = [TRACES[name](seed) for name in traces or (TRACES if recorded is None else ())]
     if recorded is not None:
-        played.append(read_trace(recorded))
+        played.append(read_any(recorded))
     result: dict[str, Any] = {
         "seed": seed,
         "traces": {trace.name: on_trace(trace, budgets_mb, progress) for trace in played},

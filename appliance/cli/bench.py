@@ -268,7 +268,7 @@ def policy(
 
     Args:
         traces: azure, poisson, bursts, diurnal, timer; all of them when none is named and no file is given.
-        trace: JSONL file of a recorded trace, one arrival a line.
+        trace: A recorded trace: a fleet's MCAP log, or a JSONL file with an arrival a line.
         budgets: Memory of a gateway's containers, MB.
         gateways: Numbers of gateways for federated against local; 0 leaves that out.
         seed: Of the generated traces.
