@@ -1,6 +1,6 @@
 """A volume's files as one tar archive, and back: the same state gives the same bytes on every gateway.
 
-Entries come in the order of their age: what did not change since the last transfer keeps its place at the front,
+Files come in the order of their age: what did not change since the last transfer keeps its place at the front,
 and with it its chunks. Only plain files, folders and symbolic links that stay inside are moved; the owner is
 always the service user (root in a container), times are whole seconds. An archive of somebody else is believed
 in nothing: whatever would end up outside, or is anything else, is refused before it is made.
@@ -198,7 +198,7 @@ def pack(root: Path, target: Path, *, name: str, chunk_bytes: int, most_files: i
         with target.open("wb") as out:
             writer = cast("BinaryIO", _Writer(out, digests))
             with tarfile.TarFile(fileobj=writer, mode="w", format=tarfile.PAX_FORMAT, copybufsize=_COPY) as tar:
-                for each in sorted(entries, key=_order):
+                for each in _ordered(entries):
                     _add(tar, root, each)
     except OSError as error:
         target.unlink(missing_ok=True)
@@ -209,10 +209,20 @@ def pack(root: Path, target: Path, *, name: str, chunk_bytes: int, most_files: i
     return digests.manifest("volume", name)
 
 
-def _order(entry: Entry) -> tuple[int, int, str]:
-    if stat.S_ISDIR(entry.mode):
-        return 0, 0, entry.path
-    return 1, _seconds(entry), entry.path
+def _ordered(entries: list[Entry]) -> Iterator[Entry]:
+    """Files by age, each folder before the first that lies in it; then empty folders, then links.
+
+    So what is new stands behind what is old, and the old keeps its place in the archive and its chunks.
+    """
+    folders = {each.path: each for each in entries if stat.S_ISDIR(each.mode)}
+    files = [each for each in entries if stat.S_ISREG(each.mode)]
+    for file in sorted(files, key=lambda each: (_seconds(each), each.path)):
+        for parent in reversed(PurePosixPath(file.path).parents):
+            if (folder := folders.pop(parent.as_posix(), None)) is not None:
+                yield folder
+        yield file
+    yield from (folders[path] for path in sorted(folders))
+    yield from sorted((each for each in entries if stat.S_ISLNK(each.mode)), key=lambda each: each.path)
 
 
 def _seconds(entry: Entry) -> int:
@@ -227,7 +237,7 @@ def _add(tar: tarfile.TarFile, root: Path, entry: Entry) -> None:
         tar.addfile(info)
     elif stat.S_ISLNK(entry.mode):
         check_link(entry.path, entry.target)
-        info.type, info.linkname, info.mode = tarfile.SYMTYPE, entry.target, 0o777
+        info.type, info.linkname, info.mode, info.mtime = tarfile.SYMTYPE, entry.target, 0o777, 0
         tar.addfile(info)
     else:
         info.size = entry.size

@@ -56,22 +56,23 @@ def test_all_comes_back_and_gives_the_same_bytes_again(tmp_path: Path) -> None:
 
 
 def test_what_did_not_change_keeps_its_chunks(tmp_path: Path) -> None:
-    """A file that is written anew moves to the end: the chunks of the older ones before it stay as they are."""
-    root = tmp_path / "root"
-    root.mkdir()
+    """Files written anew, new folders and links come behind: all chunks of the older files stay, also of a copy."""
+    root, copy = tmp_path / "root", tmp_path / "copy"
+    (root / "d").mkdir(parents=True)
     for number in range(4):
-        (root / f"f{number}").write_bytes(bytes([number]) * 2 * CHUNK)
-        os.utime(root / f"f{number}", (number, number))
+        (root / "d" / f"f{number}").write_bytes(bytes([number]) * 2 * CHUNK)
+        os.utime(root / "d" / f"f{number}", (number, number))
+    (root / "a-link").symlink_to("d")
     before = packed(root, tmp_path / "one")
-    (root / "f0").write_bytes(b"x" * CHUNK)
-    os.utime(root / "f0", (9, 9))
-    (root / "f3").write_bytes(b"y" * CHUNK)
-    os.utime(root / "f3", (10, 10))
-    os.utime(root / "f1", (0, 0))
-    (root / "f9").write_bytes(b"new")
-    after = packed(root, tmp_path / "two")
-    same = {before.chunk(index) for index in range(before.count)} & {after.chunk(index) for index in range(after.count)}
-    assert len(same) >= 1
+    unpacked(tmp_path / "one", copy)
+    (copy / "d" / "f3").write_bytes(b"y" * CHUNK)
+    (copy / "b" / "c").mkdir(parents=True)
+    (copy / "b" / "c" / "new").write_bytes(b"new")
+    (copy / "another-link").symlink_to("d")
+    (copy / "empty").mkdir()
+    after = packed(copy, tmp_path / "two")
+    whole = 3 * 2 * CHUNK // CHUNK
+    assert [after.chunk(index) for index in range(whole)] == [before.chunk(index) for index in range(whole)]
 
 
 def test_fingerprint_sees_every_kind_of_change(tmp_path: Path) -> None:
