@@ -2,6 +2,7 @@
 
 Stoica, Morris, Liben-Nowell, Karger, Kaashoek, Dabek, Balakrishnan: "Chord: A Scalable Peer-to-Peer Lookup Protocol
 for Internet Applications", IEEE/ACM Transactions on Networking 11(1), February 2003, pp. 17-32; first in SIGCOMM 2001.
+The figures of the table were written down without a copy of the paper at hand: compare before citing them further.
 """
 
 import math

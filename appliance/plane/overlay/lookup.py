@@ -39,8 +39,8 @@ class Lookup:
         self.result: Owners | None = None
         self.hops = 0
         """Members that answered, the owner among them: 0 when the position is one's own, 1 when the owner is known."""
-        self.gone: set[str] = set()
-        """Members asked in vain."""
+        self.gone: dict[str, None] = {}
+        """Members asked in vain, in that order."""
         self._asked: set[str] = {view.me}
         self._before: dict[str, int] = {}
         """Not yet asked: name -> distance from it on to the position."""
@@ -73,7 +73,7 @@ class Lookup:
 
     def failed(self, name: str) -> None:
         """A member that was asked is not there."""
-        self.gone.add(name)
+        self.gone[name] = None
         self._owners.pop(name, None)
         self._end()
 

@@ -133,4 +133,4 @@ def test_a_dead_owner_is_passed_over() -> None:
     found = lookup.result
     assert found is not None
     assert found.owner == third
-    assert {first, second} <= lookup.gone
+    assert {first, second} <= lookup.gone.keys()
