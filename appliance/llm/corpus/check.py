@@ -189,8 +189,9 @@ def _order(pair: Pair, catalogue: Catalogue) -> Iterable[str]:
 
 def _feeds(subtask: Subtask, pair: Pair, reach: dict[str, frozenset[str]]) -> Iterable[str]:
     producers = {each.id for each in pair.subtasks if each.skill in _FEEDS.get(subtask.skill, ())}
-    if producers and not producers & reach[subtask.id]:
-        yield f"{subtask.id} ({subtask.skill}): it must come after what it uses, one of {', '.join(sorted(producers))}"
+    aside = {each for each in producers if subtask.id not in reach[each]}
+    if aside and not producers & reach[subtask.id]:
+        yield f"{subtask.id} ({subtask.skill}): it must come after what it uses, one of {', '.join(sorted(aside))}"
 
 
 def _moves(pair: Pair) -> Iterable[str]:
