@@ -148,6 +148,20 @@ def zygote(
 
 
 @bench_app.command
+def transfer(*, megabytes: int = 64, rounds: int = 3, as_json: Json = False) -> int:
+    """How long a state volume takes from gateway to gateway, beside Podman's own export and import.
+
+    Args:
+        megabytes: Size of the volume.
+        rounds: Rounds of each way; the median counts.
+    """
+    from appliance.bench.transfer import run
+
+    tell(measure(run(megabytes, rounds, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
 def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: int = 1, as_json: Json = False) -> int:
     """Thousands of subtasks through one gateway, some of which misbehave: counts before and after, leaks, memory.
 

@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from appliance.bench import actors, federated, pooled, rate, refill, soak, startup, zygote
+from appliance.bench import actors, federated, pooled, rate, refill, soak, startup, transfer, zygote
 from appliance.pool.engine import PodmanEngine
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
@@ -161,3 +161,10 @@ async def test_zygote(built: None) -> None:
     for each in result["heaps"]:
         assert [each[key]["count"] for key in ("fork", "ahead", "at_once", "python")] == [2, 2, 2, 1]
         assert each["rss_mb"] > 4
+
+
+async def test_transfer(built: None) -> None:
+    """A small volume is moved to a gateway that has nothing of it, again after a change, and by Podman."""
+    result = await transfer.run(1, 1, progress=lambda _: None)
+    assert all(result[f"{way}_ms"] > 0 for way in ("first", "again", "podman"))
+    assert 0 < result["wire_share"] <= 1.5
