@@ -52,6 +52,7 @@ from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_
 from appliance.tasks.checkpoints import read_checkpoint, remove_checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
+from appliance.tasks.listing import newest_tasks
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement, bind, holds, place
@@ -416,35 +417,7 @@ class TaskManager:
 
     async def tasks(self, ask: TasksAsk) -> TaskList:
         """Return the newest tasks, of the whole fleet or of this gateway's shard."""
-        found: dict[str, TaskRecord] = {}
-        for stored in await self.plane.dht.local("task/"):
-            if not stored.deleted:
-                with contextlib.suppress(PayloadError):
-                    record = read_record(stored.value)
-                    found[record.id] = record
-        for driver in self._drivers.values():
-            found[driver.record.id] = driver.record
-        unreachable: list[str] = []
-        if not ask.local:
-            others = sorted(self.plane.members() - {self.plane.gateway})
-            answers = await asyncio.gather(
-                *(
-                    self.plane.rpc.call(other, "tasks", replace(ask, local=True), TaskList, timeout_s=2.0)
-                    for other in others
-                ),
-                return_exceptions=True,
-            )
-            for other, answer in zip(others, answers, strict=True):
-                if isinstance(answer, TaskList):
-                    for record in answer.tasks:
-                        if record.id not in found or found[record.id].sequence < record.sequence:
-                            found[record.id] = record
-                elif isinstance(answer, SwiftbotError):
-                    unreachable.append(other)
-                else:
-                    raise answer
-        newest = sorted(found.values(), key=lambda record: (record.created_ns, record.id), reverse=True)
-        return TaskList(tasks=tuple(newest[: max(0, ask.limit)]), unreachable=tuple(unreachable))
+        return await newest_tasks(self.plane, ask, [driver.record for driver in self._drivers.values()])
 
     async def cancel(self, ask: TaskAsk) -> TaskRecord:
         """Stop a task wherever it is coordinated; returns its record at that moment."""

@@ -48,7 +48,7 @@ id = "{name}"
 domain = "coordination"
 summary = "A test's own skill."
 runs = "compute"
-image = "base"
+image = "{image}"
 volumes = {volumes}
 timeout_s = 120
 retries = 1
@@ -83,11 +83,12 @@ def run(ctx):
 @pytest.fixture
 def skills(tmp_path: Path) -> Path:
     """A folder with skills of the tests' own: one counts and saves how far it is, one ends at once, one has state."""
-    for name, handler in (("count_up", COUNT), ("quick", QUICK), ("diary", DIARY)):
+    for name, handler in (("count_up", COUNT), ("quick", QUICK), ("diary", DIARY), ("look", QUICK)):
         folder = tmp_path / "skills" / name
         folder.mkdir(parents=True)
         volumes = '["diary"]' if name == "diary" else "[]"
-        (folder / "skill.toml").write_text(MANIFEST.format(name=name, volumes=volumes))
+        image = "vision" if name == "look" else "base"
+        (folder / "skill.toml").write_text(MANIFEST.format(name=name, image=image, volumes=volumes))
         (folder / "handler.py").write_text(handler)
     return tmp_path / "skills"
 
@@ -188,6 +189,29 @@ async def test_work_goes_on_from_its_checkpoint_when_its_gateway_is_killed(up: U
         first = done.attempts[0]
         assert first.placed
         assert done.attempts[-1].choice is not None
+
+
+async def test_a_plan_has_its_next_containers_warmed(up: Up) -> None:
+    """While the first subtask runs, a container of the second one's image is started because the plan will need it."""
+    fleet = await up(gateways=2, pool=PoolConfig(floor={"base": 1}))
+    plan = Plan(
+        domain="coordination",
+        subtasks=(Subtask(id="s1", skill="count_up"), Subtask(id="s2", skill="look", after=("s1",))),
+    )
+    async with FleetClient(fleet.endpoint) as client:
+        accepted = await client.submit(TaskRequest(instruction="count, then look", plan=plan))
+        ended = await end(client, accepted.id)
+        assert ended.state is TaskState.SUCCEEDED, ended.failure
+        found, silent = await client.pool_decisions(100)
+    assert not silent
+    reasons = [
+        each.why
+        for answer in found.values()
+        for each in answer.decisions
+        if each.what == "start" and each.image == "vision"
+    ]
+    print(reasons, ended.of("s2").phase, ended.of("s2").startup_ms)
+    assert any("plan" in each for each in reasons), reasons
 
 
 async def test_the_command_line_explains_attempts_and_steers_pools(up: Up) -> None:
