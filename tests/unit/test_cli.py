@@ -10,7 +10,8 @@ COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "fleet",
     "pool", "robots list", "robots qgc-actions", "log info", "log replay", "log recover",
     "log merge", "log trim", "log cat", "log pin", "sim mavlink", "sim zenoh", "images build", "images list",
-    "images fetch", "doctor", "tui", "bench startup", "bench rate", "bench refill", "bench soak", "bench zygote", "bench transfer",
+    "images fetch", "doctor", "tui", "bench startup", "bench rate", "bench refill", "bench soak", "bench zygote",
+    "bench transfer",
     "bench table", "pool list", "pool why", "pool warm", "pool evict", "pool release", "pool decisions",
 ]  # fmt: skip
 
