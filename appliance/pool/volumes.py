@@ -15,19 +15,20 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Iterable
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import msgspec
 import structlog
 from msgspec import Struct
 
-from appliance.errors import ConflictError, NotFoundError, PayloadError, PoolError, RefusedError, SwiftbotError
+from appliance.errors import ConflictError, NotFoundError, PoolError, RefusedError, SwiftbotError
 from appliance.model import VersionVector, VolumeInfo
 from appliance.plane.keys import check_name
 from appliance.plane.store import Store
-from appliance.plane.versions import Record, increment
+from appliance.plane.versions import increment
 from appliance.pool import lineage
 from appliance.pool.engine import LABEL_FLEET, LABEL_GATEWAY
+from appliance.pool.fleetwide import Fleetwide, Records
 from appliance.pool.lineage import Relation, VolumeRecord, generation, relation
 from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.archive import fingerprint, no_room, unpack
@@ -43,20 +44,6 @@ LABEL_KEPT = "swiftbot.kept"
 """Of a volume that keeps a state which lost against another gateway's: the name of the volume it was of."""
 _TRIES = 8
 _TELL_AGAIN_S = 2.0
-
-
-class Records(Protocol):
-    """Replicated records with compare-and-set: `plane.dht`."""
-
-    async def read(self, key: str) -> Record | None:
-        """Return a record or None; UnreachableError when no replica answers."""
-        ...
-
-    async def write(
-        self, key: str, value: bytes, *, expected: VersionVector | None, durable: bool = True
-    ) -> VersionVector:
-        """Compare and set; ConflictError when it has moved on."""
-        ...
 
 
 class State(Struct, frozen=True, kw_only=True):
@@ -121,12 +108,10 @@ class Volumes:
         self.on_change: Callable[[], None] = lambda: None
         """Called when `infos` has changed."""
         self._config, self._fleet, self._gateway = config, fleet, gateway
-        self._store, self._records, self._storage = store, records, storage
+        self._store, self._storage = store, storage
         self._labels = {LABEL_FLEET: fleet, LABEL_GATEWAY: gateway}
         self._volumes: dict[str, _Volume] = {}
-        self._heard: dict[str, dict[str, VolumeInfo]] = {}
-        """By gateway, then by name."""
-        self._newest: dict[str, VolumeRecord] = {}
+        self._fleetwide = Fleetwide(records, refuse=self._refuse)
         self._telling: asyncio.Task[None] | None = None
         self._untold = asyncio.Event()
 
@@ -284,17 +269,7 @@ class Volumes:
         Raises:
             UnreachableError: no replica of the record answers.
         """
-        record = await self._records.read(f"{lineage.KEY}{check_name(name, 'volume')}")
-        return None if record is None else self._read(name, record)
-
-    def _read(self, name: str, record: Record) -> VolumeRecord | None:
-        try:
-            found = lineage.read(record.value)
-        except PayloadError as error:
-            self._refuse("volume record damaged", volume=name, reason=str(error))
-            return None
-        self._newest[name] = found
-        return found
+        return (await self._fleetwide.read(name))[0]
 
     async def _tell(self, name: str) -> None:
         """Have the fleet's record name our state, unless a newer one or the winner of two is there.
@@ -302,11 +277,10 @@ class Volumes:
         Raises:
             UnreachableError: the record cannot be read or written.
         """
-        key, volume = f"{lineage.KEY}{name}", self._volume(name)
+        volume = self._volume(name)
         for _ in range(_TRIES):
             state = volume.state
-            record = await self._records.read(key)
-            theirs = None if record is None else self._read(name, record)
+            theirs, seen = await self._fleetwide.read(name)
             stands = (
                 Relation.NEWER
                 if theirs is None
@@ -322,14 +296,13 @@ class Volumes:
             if stands in (Relation.NEWER, Relation.WINS):
                 mine = VolumeRecord(name=name, version=state.version, gateway=state.writer, size_bytes=state.size_bytes)
                 try:
-                    await self._records.write(key, msgspec.json.encode(mine), expected=record and record.version)
+                    await self._fleetwide.write(mine, expected=seen)
                 except ConflictError:
                     continue
-                self._newest[name] = mine
             if volume.state == state:
                 await self._set(name, msgspec.structs.replace(state, told=True))
                 return
-        raise ConflictError(f"{key} keeps moving on", remedy="it is told again in a moment")
+        raise ConflictError(f"the record of volume {name} keeps moving on", remedy="it is told again in a moment")
 
     def has(self, name: str, newest: VolumeRecord) -> bool:
         """Whether that state, or one that stands against it, is here."""
@@ -341,24 +314,18 @@ class Volumes:
 
     def hear(self, gateway: str, volumes: Iterable[VolumeInfo]) -> None:
         """Take note of what another gateway's status says of its volumes; nothing when it is gone."""
-        self._heard[gateway] = {each.name: each for each in volumes}
-        if not self._heard[gateway]:
-            del self._heard[gateway]
+        self._fleetwide.hear(gateway, volumes)
 
     def _generations(self, name: str) -> dict[str, int]:
         """Who is known to have which generation."""
-        found = {gateway: infos[name].generation for gateway, infos in self._heard.items() if name in infos}
-        if newest := self._newest.get(name):
-            told = generation(newest.version)
-            found[newest.gateway] = max(told, found.get(newest.gateway, 0))
         volume = self._volumes.get(name)
-        found[self._gateway] = generation(volume.state.version) if volume else 0
-        return found
+        mine = generation(volume.state.version) if volume else 0
+        return self._fleetwide.generations(name) | {self._gateway: mine}
 
     def newest_here(self, name: str) -> bool:
         """Whether no newer state than ours is known of (from what was heard; no question is asked)."""
         found = self._generations(name)
-        newest, volume = self._newest.get(name), self._volumes.get(name)
+        newest, volume = self._fleetwide.told.get(name), self._volumes.get(name)
         if newest is not None and volume is not None and not self.has(name, newest):
             return False
         return found[self._gateway] >= max(found.values())
@@ -371,13 +338,7 @@ class Volumes:
 
     def size_bytes(self, names: Iterable[str]) -> int:
         """Bytes of these volumes' newest states together that are not here: what `Transfers.cost_ms` is asked with."""
-        total = 0
-        for name in names:
-            if not self.newest_here(name):
-                known = [infos[name].size_bytes for infos in self._heard.values() if name in infos]
-                newest = self._newest.get(name)
-                total += max([*known, newest.size_bytes if newest else 0])
-        return total
+        return sum(self._fleetwide.size_bytes(name) for name in names if not self.newest_here(name))
 
     def infos(self) -> tuple[VolumeInfo, ...]:
         """Volumes whose newest state is here, for GatewayStatus.volumes."""

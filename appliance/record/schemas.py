@@ -160,6 +160,10 @@ class KeySchemas:
                     note="string",
                 ),
             ),
+            (
+                keys.transfer(),
+                _outline("Transfer", what="string", state="string", done_bytes="number", size_bytes="number"),
+            ),
             (keys.exchange(), _outline("Exchange", verb="string", gateway="string", duration_ms="number")),
             (keys.run(), struct_kind(RunEvent)),
             (keys.robot(), struct_kind(RobotInfo)),

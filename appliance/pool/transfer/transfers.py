@@ -59,6 +59,8 @@ _TELL_S = 0.5
 _LOOK_S = 30.0
 """How often Podman is asked which images are there: one may have been built or removed by hand."""
 _PENDING_S = 0.3
+_MOST_ASKED = 8
+"""Gateways asked for an image that no status lists: whoever has it lists it within seconds."""
 
 
 class Transfers:
@@ -259,7 +261,7 @@ class Transfers:
 
     async def _bring_image(self, reference: str, first: str, job: Job) -> Brought:
         listed = [gateway for gateway, status in self._plane.registry.gateways.items() if reference in status.images]
-        sources = self._sources([first, *listed]) or self._sources(sorted(self._plane.members()))
+        sources = self._sources([first, *listed]) or self._sources(sorted(self._plane.members()))[:_MOST_ASKED]
         problem: SwiftbotError = NotFoundError(
             f"no gateway that answers has image {reference}", remedy="swiftbot images build"
         )

@@ -5,7 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.tasks.resolve import stronger
+from appliance.plane.dht import Record
+from appliance.pool.lineage import VolumeRecord
+from appliance.tasks.resolve import resolver, stronger
 
 
 def record(state: TaskState, done: int, sequence: int, coordinator: str) -> bytes:
@@ -57,3 +59,12 @@ def test_what_cannot_be_read_never_stands_against_what_can() -> None:
     """A damaged record loses to any readable one."""
     good = record(TaskState.ACCEPTED, 0, 1, "gw-9")
     assert stronger(b"\xff\xff", good) == good
+
+
+def test_volumes_are_resolved_by_their_lineage() -> None:
+    """Of two records of a volume the one with more runs behind it stands, whichever bytes are the larger."""
+    more, fewer = (
+        Record(key="volume/v", value=msgspec.json.encode(VolumeRecord(name="v", version=version, gateway="a")))
+        for version in ({"a": 3}, {"a": 1, "z": 1})
+    )
+    assert resolver("volume/v", more, fewer) == resolver("volume/v", fewer, more) == more
