@@ -10,6 +10,7 @@ import errno
 import marshal
 import mmap
 import os
+import select
 import signal
 import socket
 import sys
@@ -37,7 +38,7 @@ MAX_ORDER = 64 * 1024
 """Longest order in bytes that is handed to a child forked ahead: it fits into a socket's buffer, so nobody waits."""
 
 # Bytes of the memory shared with the zygote.
-IN_TRANSIT, DONE, REASON = 0, 1, 2
+IN_TRANSIT, DONE, REASON, TAKEN = 0, 1, 2, 3
 REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned"}
 SLOW = "raise timeout_s in its skill.toml, or find out what it waits for"
 LARGE = "put large things with ctx.put_artifact and return the reference"
@@ -252,10 +253,12 @@ class _Child:
 def wait(kit: Kit, channel: socket.socket) -> NoReturn:
     """Get ready, wait for an order on `channel`, carry it out; ends when the other side of it is closed."""
     child = _Child(kit, channel.fileno())
-    child.warm_up()
+    if not select.select([channel], [], [], 0)[0]:  # no order is there yet
+        child.warm_up()
     message, handles, _, _ = socket.recv_fds(channel, MAX_ORDER, 1)
     if not message or not handles:
         os._exit(0)
+    kit.shared[TAKEN] = 1
     channel.close()
     child.carry_out(marshal.loads(message), socket.socket(fileno=handles[0]))  # noqa: S302 - of our own zygote
 

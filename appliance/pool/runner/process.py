@@ -32,6 +32,8 @@ class Run:
         self.timeout_s = 0.0
         self.deadline = 0.0
         self.kill_at: float | None = None
+        self.order: Frame | None = None
+        """What it was handed, for another child if this one dies before it takes it."""
         self._channel: socket.socket | None = None
 
     @classmethod
@@ -81,7 +83,12 @@ class Run:
             return False
         channel.close()
         self._channel = None
+        self.order = order
         return True
+
+    def untaken(self) -> Frame | None:
+        """Return the order that a child has died without having looked at, unless it was told to end."""
+        return None if self.shared[child.TAKEN] or self.kill_at is not None else self.order
 
     def begin(self, order: Frame, peer: socket.socket, timeout_s: float) -> None:
         """Note what it runs and until when."""

@@ -10,6 +10,7 @@ long), the child is forked with the order in hand.
 """
 
 import contextlib
+import marshal
 import os
 import select
 import shutil
@@ -137,7 +138,7 @@ class Zygote:
 
     def _read(self, connection: Connection) -> None:
         try:
-            data = connection.peer.recv(1 << 20, socket.MSG_DONTWAIT)
+            data = connection.peer.recv(1 << 16, socket.MSG_DONTWAIT)
         except BlockingIOError:
             return
         except OSError:
@@ -237,6 +238,24 @@ class Zygote:
             with contextlib.suppress(OSError):  # no further process now: it is forked with its order
                 self._ahead = Run.fork(self._kit())
                 self._fork_ms = self._ahead.fork_ms
+        self._warm_up()
+
+    def _fork_again(self, run: Run, order: Frame, peer: socket.socket) -> bool:
+        """Give an order to another child: the one that waited had died, and nothing of it was begun."""
+        with contextlib.suppress(OSError):
+            self._run = Run.fork(self._kit(), order, peer)
+            self._run.begin(order, peer, run.timeout_s)
+            run.forget()
+            return True
+        return False
+
+    def _warm_up(self) -> None:
+        """Touch what the next order will touch: it is copied now that a child shares it, and not on the order's way."""
+        decoder = Decoder()
+        decoder.feed(encode({"op": "run", "skill": "", "params": {"a": [1.0, "b"]}, "timeout_s": 1.0}))
+        order = decoder.next() or {}
+        marshal.dumps(order)
+        self._refusal(order)
 
     def _watch(self) -> None:
         run = self._run
@@ -267,6 +286,9 @@ class Zygote:
         peer = run.peer
         assert peer is not None  # noqa: S101 - a run of the moment has one
         run.kill()
+        order = run.untaken()
+        if order is not None and self._fork_again(run, order, peer):
+            return
         last = run.autopsy(status)
         if last is not None:
             self._send(peer, last)

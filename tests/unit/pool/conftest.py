@@ -47,7 +47,7 @@ def run(ctx):
         print("printed")
         ctx.partial({"so": "far"})
         return {"params": ctx.params, "inputs": ctx.inputs, "robot": ctx.robot, "site": ctx.site.get("name"),
-                "runs": STATE["runs"], "scratch": str(ctx.scratch), "here": os.getcwd()}
+                "runs": STATE["runs"], "scratch": str(ctx.scratch), "here": os.getcwd(), "pid": os.getpid()}
     if do == "call":
         answer = ctx.command("goto", timeout_s=5, x=1)
         reference = ctx.put_artifact("a.bin", b"\\x00\\xff", "application/x")
@@ -90,6 +90,12 @@ def run(ctx):
         os._exit(3)
     if do == "sys.exit":
         sys.exit(4)
+    if do == "long checkpoint":
+        ctx.checkpoint({"x": "y" * 2**20})
+    if do == "list checkpoint":
+        ctx.checkpoint([1])
+    if do == "resume":
+        return ctx.resume
     if do == "large":
         return {"x": "y" * (5 * 2**20)}
     if do == "huge call":

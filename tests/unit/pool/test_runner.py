@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import os
+import signal
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,11 @@ async def _run(zygote: Zygote, do: str, **more: Any) -> list[dict[str, Any]]:
     params = {"do": do, **more.pop("params", {})}
     await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": params, "timeout_s": 10.0} | more)
     return await _finish(connection)
+
+
+def children_of(parent: int) -> list[int]:
+    """Return the processes that a process has started itself."""
+    return [int(each) for each in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
 
 
 def _gone(pid: int) -> bool:
@@ -258,6 +265,64 @@ async def test_stop_ends_the_run_and_the_runner(zygote: Zygote, tmp_path: Path) 
     assert _gone(pid)
     process = zygote.process  # type: ignore[attr-defined]
     assert await asyncio.wait_for(process.wait(), 10) == 0
+
+
+async def _waiting(zygote: Zygote) -> int:
+    """The child that is forked ahead, once it is there."""
+    pid = zygote.process.pid  # type: ignore[attr-defined]
+    async with asyncio.timeout(10):
+        while not (found := [each for each in children_of(pid) if not _gone(each)]):
+            await asyncio.sleep(0.005)
+    return found[0]
+
+
+async def test_a_run_begins_in_the_child_that_waits(zygote: Zygote) -> None:
+    """A run's process was forked ahead of its order, and has its own scratch folder; the next has another."""
+    await zygote()
+    for _ in range(2):
+        waiting = await _waiting(zygote)
+        result = (await _run(zygote, "echo"))[-1]["result"]
+        assert result["pid"] == waiting
+        assert result["runs"] == 1
+        await _wait_gone(waiting)
+
+
+async def test_without_a_child_that_waits(zygote: Zygote) -> None:
+    """Where the child that waits was killed, or the order is long, one is forked for the order."""
+    await zygote()
+    waiting = await _waiting(zygote)
+    os.kill(waiting, signal.SIGKILL)
+    assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
+    waiting = await _waiting(zygote)
+    result = (await _run(zygote, "echo", inputs={"long": {"text": "x" * 2**20}}))[-1]["result"]
+    assert len(result["inputs"]["long"]["text"]) == 2**20
+    assert result["pid"] != waiting
+    await _wait_gone(waiting)
+
+
+async def test_a_cancel_before_the_handler_begins(zygote: Zygote) -> None:
+    """A cancel that comes with the order, before the child has looked at it, ends the run as cancelled."""
+    connection, control = await zygote(), await zygote()
+    waiting = await _waiting(zygote)
+    os.kill(waiting, signal.SIGSTOP)
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": {"do": "echo"}})
+    async with asyncio.timeout(10):
+        while True:
+            await control.send({"op": "cancel", "run": "r1"})
+            if (await control.receive())["ok"]:
+                break
+    os.kill(waiting, signal.SIGCONT)
+    last = (await _finish(connection))[-1]
+    assert (last["code"], last["retryable"]) == ("cancelled", False)
+    assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
+
+
+async def test_news_that_are_too_long(zygote: Zygote) -> None:
+    """A checkpoint beyond its bound, or that is no dict, is an error in the handler, with what to do instead."""
+    for do in ("long checkpoint", "list checkpoint"):
+        error = (await _run(zygote, do))[-1]
+        assert error["code"] == "payload"
+    assert (await _run(zygote, "resume", resume={"step": 3}))[-1]["result"] == {"step": 3}
 
 
 def test_frames_round_trip() -> None:
