@@ -2,12 +2,15 @@
 
 Doors:
     pool.Pool            select, run, cancel, drain: what the task manager uses
+    verbs.Verbs          warm, evict, release, hint, decisions: what operators and other gateways ask (`api`)
     selection            Algorithm 1 as plain functions; Candidate, Decision
     images               build and list the images that skills run in
+    volumes, transfer    state volumes and images that move between gateways
     engine.remove_fleet  remove a fleet's containers and volumes from this machine
     settings.PoolConfig  section `[pool]` of a gateway's file
 
-Inside, from above to below: pool (the door), conversation (one run), keeper (the books), policies (eviction,
-prewarming, costs), starter (what a container is), container (its connections), engine (Podman), runner (what
-runs within).
+Inside, from above to below: pool (the door), running (runs in progress), conversation (one run), keeper (tending:
+starts ahead, probes, replaces, gives up), books (who has which, who waits), policies (what to keep, give up and start),
+pressure (memory), starts (starts in progress, quarantine), starter (what a container is), container (its connections),
+link and engine (Podman), runner (what runs within).
 """

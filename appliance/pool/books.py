@@ -6,8 +6,8 @@ a container, and nothing here is awaited but one's turn.
 """
 
 import asyncio
+import itertools
 import math
-import secrets
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -62,6 +62,7 @@ class Books:
         self._waiting: deque[_Waiter] = deque()
         self._watchers: set[asyncio.Event] = set()
         self._telling = False
+        self._numbers = itertools.count(1)
 
     # --- what is --------------------------------------------------------------------------------------------
 
@@ -151,7 +152,7 @@ class Books:
     def reserve(self, container_id: str) -> str:
         """Hold a ready container for the lease and return the reservation's name."""
         container = self._held[container_id]
-        self.hold(container, secrets.token_hex(4))
+        self.hold(container, f"r{next(self._numbers)}")
         return container.reservation
 
     def hold(self, container: PooledContainer, reservation: str) -> None:

@@ -17,6 +17,7 @@ import json
 import os
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -170,6 +171,8 @@ class PodmanEngine:
         self._threads = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="podman")
         self._local = threading.local()
         self._clients: list[Any] = []
+        self.calls: Counter[str] = Counter()
+        """What was asked of Podman since the start, by the first word of what it was for: a warm run asks nothing."""
 
     def _client(self) -> Any:  # podman-py is untyped in the parts used here
         client = getattr(self._local, "client", None)
@@ -180,6 +183,8 @@ class PodmanEngine:
         return client
 
     async def _ask(self, what: str, work: Callable[[Any], T]) -> T:
+        self.calls[what.partition(" ")[0]] += 1
+
         def call() -> T:
             try:
                 self._knock()

@@ -431,7 +431,8 @@ class Keeper:
             container.missed_probes += 1
             if container.missed_probes >= self._config.probe_failures:
                 self.retire(container, f"does not answer: {error.message}")
-        container.next_probe = time.monotonic() + self._config.probe_s
+        finally:
+            container.next_probe = time.monotonic() + self._config.probe_s
 
     async def _sweep(self) -> None:
         """Remove containers of ours that Podman has and the books have not."""
@@ -440,6 +441,8 @@ class Keeper:
             return
         try:
             for found in await self._starter.own(engine):
+                if self._stopped or self.draining:
+                    return  # what is kept is the next gateway's, which may be here already
                 if self.books.get(found.labels.get(LABEL_ID, "")) is None:
                     log.info("stray container removed", container=found.name)
                     await engine.remove(found.id)
