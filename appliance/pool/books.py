@@ -186,6 +186,13 @@ class Books:
         found = best_local(self.facts(), need, self._config.weights)
         return self._held[found[0].id] if found is not None else None
 
+    def take(self, need: Need) -> PooledContainer | None:
+        """Hold a container that is ready, for somebody who would otherwise wait or have one started."""
+        container = self._ready_for(need)
+        if container is not None:
+            self.hold(container, IN_TURN)
+        return container
+
     def busy(self, container: PooledContainer, run_id: str) -> None:
         """Note that a run has it."""
         container.reservation = ""
@@ -245,10 +252,8 @@ class Books:
         for waiter in tuple(self._waiting):
             if waiter.got.done() or waiter.need in in_vain:
                 continue
-            container = self._ready_for(waiter.need)
-            if container is not None:
-                self.hold(container, IN_TURN)
-            else:
+            container = self.take(waiter.need)
+            if container is None:
                 try:
                     container = self._begin(waiter.need)
                 except SwiftbotError as error:

@@ -291,6 +291,8 @@ class Keeper:
             PoolError, PrerequisiteError, UnreachableError: none started, or none came free in time.
             RefusedError: too many wait already.
         """
+        if (container := self.books.take(need)) is not None:
+            return container  # it came free meanwhile
         self.check_startable(need)
         container = self._begin(need)
         if container is None:

@@ -84,6 +84,23 @@ async def test_many_at_once(bench: Any) -> None:
         assert len(running) == len(set(running))
 
 
+async def test_one_that_comes_free_is_taken_not_given_up(bench: Any) -> None:
+    """A container that comes free just as a run is about to have another started serves it; it does not make room."""
+    pool = await bench.pool(floor={"base": 1}, capacity=1)
+    await bench.ready(pool, 1)
+    container = await pool._keeper.acquire(bench.request().need)
+    assert container.info.state is ContainerState.RESERVED
+    pool._keeper.books.give_back(container)
+
+    async def several(first: int) -> None:
+        for number in range(first, first + 10):
+            final = await pool.run(bench.request(number), COLD, lambda _: None)
+            assert final.kind is RunEventKind.SUCCEEDED
+
+    await asyncio.gather(*(several(100 * worker) for worker in range(3)))
+    assert bench.engine.created == 1
+
+
 async def test_queue_is_bounded(bench: Any, tmp_path: Path) -> None:
     """When everything is busy and the queue full a run is refused with the reason; one that waits too long fails."""
     pool = await bench.pool(capacity=1, queue=1, queue_wait_s=0.3)
