@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from appliance.bench.figures import cdf, ratio, summary
+from appliance.bench.pooled import PAUSE_S
 from appliance.errors import PoolError
 
 REMEDY = "make ray, or SWIFTBOT_RAY_PYTHON=a Python that has ray"
 ACTORS = 2
 """As many as the pool beside it keeps warm."""
 WAIT_S = 120.0
-"""For one line: Ray starts in 3 to 10 s; its cold actors take about a second each."""
+"""For one line, beside the pauses: Ray starts in 3 to 20 s; its cold actors take about a second each."""
 GRACE_S = 15.0
 PROMISED_RATIO = 3.0
 _SIDE = Path(__file__).with_name("ray_side.py")
@@ -62,7 +63,8 @@ async def run(count: int, cold: int, *, progress: Callable[[str], None]) -> dict
     progress(f"Ray: {count} warm calls, {cold} new actors")
     with tempfile.TemporaryDirectory(prefix="swiftbot-ray-") as folder:
         async with _side(python, count, cold, folder) as process:
-            found = {event: await _line(process, event) for event in ("ready", "warm", "cold")}
+            wait_s = WAIT_S + 2 * PAUSE_S * count + 5 * cold
+            found = {event: await _line(process, event, wait_s) for event in ("ready", "warm", "cold")}
     times = {
         "start": found["warm"]["start_ms"],
         "round_trip": found["warm"]["round_trip_ms"],
@@ -83,7 +85,7 @@ async def _side(python: Path, count: int, cold: int, folder: str) -> AsyncGenera
     environment |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     # -P: this folder is no place to import from.
     process = await asyncio.create_subprocess_exec(
-        str(python), "-P", str(_SIDE), str(count), str(cold), str(ACTORS), folder,
+        str(python), "-P", str(_SIDE), str(count), str(cold), str(ACTORS), str(PAUSE_S), folder,
         stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
         limit=2**24, env=environment, cwd=folder, start_new_session=True,
     )  # fmt: skip
@@ -102,12 +104,12 @@ async def _side(python: Path, count: int, cold: int, folder: str) -> AsyncGenera
                     break
 
 
-async def _line(process: asyncio.subprocess.Process, event: str) -> dict[str, Any]:
+async def _line(process: asyncio.subprocess.Process, event: str, wait_s: float) -> dict[str, Any]:
     """Return the next line, which must be of that event."""
     if process.stdout is None or process.stderr is None:
         raise PoolError("Ray's side has no pipes")
     try:
-        async with asyncio.timeout(WAIT_S):
+        async with asyncio.timeout(wait_s):
             while True:
                 line = await process.stdout.readline()
                 if not line:
@@ -116,7 +118,7 @@ async def _line(process: asyncio.subprocess.Process, event: str) -> dict[str, An
                 if line.startswith(b"{"):  # Ray itself prints as well
                     break
     except TimeoutError:
-        raise PoolError(f"Ray's side told no {event} within {WAIT_S:g} s") from None
+        raise PoolError(f"Ray's side told no {event} within {wait_s:g} s") from None
     told = json.loads(line)
     if told.get("event") != event:
         raise PoolError(f"Ray's side told {str(told)[:80]}, not {event}")

@@ -15,12 +15,10 @@ from typing import Any
 from appliance.bench import actors, fleet, startup
 from appliance.bench.figures import cdf, ratio, summary
 from appliance.bench.fleet import Progress
+from appliance.bench.pooled import PAUSE_S
 from appliance.errors import PoolError
 from appliance.model import Phase
 from appliance.pool.settings import PoolConfig
-
-PAUSE_S = 0.02
-"""Between runs, so that the container's state has been told before the next search."""
 
 
 async def run(count: int, cold: int, *, image: str, progress: Progress) -> dict[str, Any]:
@@ -58,7 +56,7 @@ async def _measure(orders: fleet.Orders, gateway: str, phase: Phase) -> float:
     outcome = await orders.run(gateway)
     if outcome.problem or outcome.phase != phase.value:
         raise PoolError(f"a run ordered at {gateway} was {outcome.problem or outcome.phase}, not {phase}")
-    await asyncio.sleep(PAUSE_S)
+    await asyncio.sleep(PAUSE_S)  # the container's state is told before the next search
     return outcome.started_ms
 
 

@@ -3,6 +3,7 @@
 import secrets
 import tempfile
 import time
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -21,8 +22,13 @@ from appliance.skills.catalogue import load_catalogue
 
 T = TypeVar("T")
 WARM_UP_S = 60.0
+PAUSE_S = 0.02
+"""Between two warm runs, in all ways that are compared: each finds the last one swept up, and is alone."""
 FLEET = "bench"
 """Fleets of benchmarks are called so, and have a random number behind it."""
+SWEEP = "list containers"
+"""What the keeper asks every half minute, whatever runs: are there containers that nobody knows?"""
+PLAIN = (SWEEP, "list images")
 SKILL = "bench_nothing"
 _MANIFEST = """
 id = "{skill}"
@@ -48,12 +54,13 @@ class WatchedEngine(PodmanEngine):
 
     def __init__(self, url: str = "") -> None:
         super().__init__(url)
-        self.requests = 0
+        self.requests: Counter[str] = Counter()
+        """By kind: the first words of what was asked, without the container."""
         self.created: list[str] = []
         """Ids of all containers made."""
 
     async def _ask(self, what: str, work: Callable[[Any], T]) -> T:
-        self.requests += 1
+        self.requests[what if what in PLAIN else what.split(" ", 1)[0]] += 1
         return await super()._ask(what, work)
 
     async def create(self, spec: ContainerSpec) -> str:

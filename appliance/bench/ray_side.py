@@ -1,6 +1,6 @@
 """The other side of the comparison, a pool of Ray actors; runs under the Python that has Ray, and needs nothing else.
 
-    python ray_side.py WARM COLD ACTORS FOLDER
+    python ray_side.py WARM COLD ACTORS PAUSE_S FOLDER
 
 It prints JSON lines: {"event": "ready" | "warm" | "cold", ...}, times in milliseconds by CLOCK_MONOTONIC, which all
 processes of a machine share.
@@ -31,7 +31,7 @@ def tell(event: str, **fields: Any) -> None:
     sys.stdout.flush()
 
 
-def main(warm: int, cold: int, actors: int, folder: str) -> None:
+def main(warm: int, cold: int, actors: int, pause_s: float, folder: str) -> None:
     """Measure, and end Ray."""
     ray: Any = importlib.import_module("ray")
     began_ns = time.monotonic_ns()
@@ -52,6 +52,7 @@ def main(warm: int, cold: int, actors: int, folder: str) -> None:
         started: list[float] = []
         ended: list[float] = []
         for number in range(warm):
+            time.sleep(pause_s)
             sent_ns = time.monotonic_ns()
             first_ns, _ = ray.get(pool[number % actors].run.remote(ORDER))
             ended.append((time.monotonic_ns() - sent_ns) / 1e6)
@@ -70,4 +71,4 @@ def main(warm: int, cold: int, actors: int, folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
+    main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]), sys.argv[5])

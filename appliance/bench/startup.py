@@ -41,7 +41,8 @@ async def run(
 
     Returns:
         For `podman_run`, `cold`, `local` and `local_round_trip` (to the result): count, p50, p90, p99, max in
-        milliseconds; `cdf` of the same; `podman_calls_per_warm_run`; and the ratios of the medians to `local`.
+        milliseconds; `cdf` of the same; `podman_requests_meanwhile` by kind, and `podman_calls_per_warm_run` without
+        the keeper's sweep, which comes by the clock; and the ratios of the medians to `local`.
 
     Raises:
         PrerequisiteError: Podman or the image is not there.
@@ -60,9 +61,12 @@ async def run(
     async with pooled.pool(warm_pool, image, make_engine=lambda: engine) as it:
         await pooled.warm(it, image, 2)
         await pooled.once(it, image, count)  # the first one pays for lazy imports on this side
-        before = engine.requests
-        local = [await pooled.once(it, image, number) for number in range(count)]
-        calls = engine.requests - before
+        before = engine.requests.copy()
+        local: list[pooled.Took] = []
+        for number in range(count):
+            await asyncio.sleep(pooled.PAUSE_S)
+            local.append(await pooled.once(it, image, number))
+        asked = engine.requests - before
     times = {
         "podman_run": podman_ms,
         "cold": cold_ms,
@@ -72,7 +76,8 @@ async def run(
     result: dict[str, Any] = {"unit": "ms", "image": image}
     result |= {name: summary(each) for name, each in times.items()}
     result["cdf"] = {name: cdf(each) for name, each in times.items()}
-    result["podman_calls_per_warm_run"] = round(calls / count, 3) if count else None
+    result["podman_requests_meanwhile"] = dict(asked)
+    result["podman_calls_per_warm_run"] = round((asked.total() - asked[pooled.SWEEP]) / count, 3) if count else None
     for name in ("podman_run", "cold"):
         result[f"{name}_over_local"] = ratio(result[name].get("p50"), result["local"].get("p50"))
     return result
