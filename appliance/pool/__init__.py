@@ -7,6 +7,7 @@ Doors:
     images               build and list the images that skills run in
     volumes, transfer    state volumes and images that move between gateways
     engine.remove_fleet  remove a fleet's containers and volumes from this machine
+    simulator.simulate   what the policies make of hours of arrivals, without a container
     settings.PoolConfig  section `[pool]` of a gateway's file
 
 Inside, from above to below: pool (the door), running (runs in progress), conversation (one run), keeper (tending:

@@ -122,7 +122,7 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     simulation, there are fewer cold starts than by a fixed time with less memory idle."""
     idle_s: Positive = 600.0
     """How long a container beyond the floor is kept idle (`fixed`), or how far ahead its next use may be expected if it
-    is of usual size and start cost (`worth`): the usual 10 minutes, which simulations of 1 to 8 GB bear out."""
+    is of usual size and start cost (`worth`): the usual 10 minutes; an hour makes little difference in simulation."""
     max_runs: Annotated[int, Meta(ge=1)] = 200
     """A container is replaced after so many runs."""
     max_growth_mb: Positive = 64.0
