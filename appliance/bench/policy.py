@@ -109,8 +109,8 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
 
     At each budget: `fewer_at_budget`, percent fewer cold starts than keep-alive with the same budget;
     `fewer_at_waste`, the same against keep-alive's curve where it wastes as much (None: it never wastes so much);
-    `on_frontier`, whether no point of another policy is better by 5 % in one of the two (and by 0.1 % of the runs, less is chance) at no more than 2 %
-    worse in the other.
+    `on_frontier`, whether no point of another policy is better by 5 % in one of the two (and by 0.1 % of the runs, less
+    is chance) at no more than 2 % worse in the other.
     """
     others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT} for each in curve]
     most_gb = 1.02 * max(each.wasted_gb for each in curves[KEEP_ALIVE])
