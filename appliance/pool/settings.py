@@ -111,8 +111,8 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     prewarm: tuple[Literal["hints", "histogram", "rate"], ...] = ("hints", "histogram")
     """What containers are started ahead for, beside the floor: `hints`: what plans have announced; `histogram`: the
     idle times of an image that is wanted regularly say that it is due; `rate`: arrival rate × service time, to
-    `hit_target`, where there is room. Without `rate` by default: in simulation it holds more memory idle and spares no
-    cold starts that keeping by worth has not spared already."""
+    `hit_target`, where there is room. Without `rate` by default: in simulation it holds more memory idle and on
+    mixed loads has more cold starts, for what it starts crowds out what would have been used."""
     hit_target: Annotated[float, Meta(gt=0, lt=1)] = 0.95
     """Part of the runs of an often used image that shall find a warm container, by `rate`."""
     keep: Literal["fixed", "histogram", "worth"] = "worth"
