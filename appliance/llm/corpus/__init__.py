@@ -4,7 +4,8 @@ The `.plan` files beside this module are the corpus, one file a setting (farm, h
 to be written and read by people. README.md says how to write a pair and how the rules' hard cases were settled.
 
 Doors: `load` (every pair, by file and line), `notation.parse` and `notation.write`, `check.problems` (one pair against
-catalogue and rules), `near.too_near` (copies within the corpus or of a test set), `tally.tally` (what it covers).
+catalogue and rules), `near.too_near` (copies within the corpus or of a test set), `tally.tally` (what it covers);
+`python -m appliance.llm.corpus` runs them all.
 """
 
 from pathlib import Path

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import PayloadError
 from appliance.llm.corpus import load
+from appliance.llm.corpus.__main__ import main
 from appliance.llm.corpus.check import problems
 from appliance.llm.corpus.near import too_near
 from appliance.llm.corpus.notation import KINDS, Pair, parse, write
@@ -18,7 +19,7 @@ from appliance.model import Subtask
 from appliance.skills.catalogue import DOMAINS, Catalogue
 
 LEAST_OF_A_SKILL = 15
-LEAST_OF_A_DOMAIN = 50
+LEAST_OF_A_DOMAIN = 75
 
 _LINE = st.text(st.characters(blacklist_categories=("Cc", "Cs"), blacklist_characters="\u2028\u2029"), max_size=30)
 _NAME = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
@@ -167,6 +168,12 @@ def test_corpus_covers_every_skill_and_domain(corpus: dict[str, Pair], catalogue
     assert {each: counted.skills[each] for each in catalogue.skills if counted.skills[each] < LEAST_OF_A_SKILL} == {}
     assert {each: counted.domains[each] for each in DOMAINS if counted.domains[each] < LEAST_OF_A_DOMAIN} == {}
     assert set(counted.refused) == set(KINDS)
+
+
+def test_running_the_package_checks_and_counts(capsys: pytest.CaptureFixture[str]) -> None:
+    """What a writer runs finds nothing wrong and counts every skill."""
+    assert main() == 0
+    assert "pairs, " in capsys.readouterr().out
 
 
 def _plans(pairs: dict[str, Pair]) -> dict[str, tuple[str, tuple[Subtask, ...]]]:
