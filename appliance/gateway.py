@@ -133,6 +133,7 @@ class Gateway:
             on_call=on_call,
             on_change=self._on_containers,
             state=state,
+            store=self.plane.store,
         )
         self.executor = Executor(self.plane, self.pool, remote, config.tasks)
         self.executor.on_change = self._changed.set

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
+import msgspec
 import structlog
 
 from appliance.errors import PoolError, RefusedError, SwiftbotError, UnreachableError
@@ -22,8 +23,10 @@ from appliance.pool.books import FOR_A_RUN, Books
 from appliance.pool.container import PooledContainer
 from appliance.pool.decisions import Decisions
 from appliance.pool.engine import LABEL_ID, Engine, EngineFacts
+from appliance.pool.experience import Experience
+from appliance.pool.glance import glance
 from appliance.pool.link import EngineLink
-from appliance.pool.policies import Idle, Planner, Retire, View
+from appliance.pool.policies import Planner, Retire, View
 from appliance.pool.pressure import MemoryWatch, Reading
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
@@ -81,7 +84,9 @@ class Keeper:
         self.starts = Starts(
             config, starter=self._starter, link=self.link, decisions=self.decisions, on_end=self._on_started
         )
-        self._planner = Planner(config, self.starts.costs, lambda image: self._starter.size(image).memory_mb)
+        self._planner = Planner(
+            config, self.starts.costs, lambda image: self._starter.size(image).memory_mb, hour=_hour
+        )
         self._memory = MemoryWatch(
             config.pressure,
             memory_mb=config.memory_mb,
@@ -180,6 +185,18 @@ class Keeper:
         self._wake.set()
         return reason
 
+    def experience(self) -> Experience:
+        """Return what was learned, to be kept."""
+        return Experience(cold_ms=self.starts.costs.state(), planner=self._planner.state())
+
+    def recall(self, experience: Experience) -> None:
+        """Go on from what was learned before a restart; images that are gone are forgotten."""
+        known = set(self._images)
+        cold_ms = {image: seen for image, seen in experience.cold_ms.items() if image in known}
+        demand = {image: each for image, each in experience.planner.demand.items() if image in known}
+        self.starts.costs.restore(cold_ms)
+        self._planner.restore(msgspec.structs.replace(experience.planner, demand=demand), time.monotonic())
+
     # --- life -----------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
@@ -235,36 +252,12 @@ class Keeper:
 
     def _view(self) -> View:
         """Return what there is, as the planner sees it."""
-        idle: list[Idle] = []
-        busy: Counter[str] = Counter()
-        starting: Counter[str] = Counter()
-        for container in self.books:
-            info = container.info
-            match info.state:
-                case ContainerState.READY:
-                    idle.append(
-                        Idle(
-                            id=info.id,
-                            image=info.image,
-                            memory_mb=info.memory_mb,
-                            runs=info.runs,
-                            cold_ms=info.cold_ms or self.starts.costs.of(info.image),
-                            since=container.idle_since,
-                        )
-                    )
-                case ContainerState.STARTING:
-                    starting[info.image] += 1
-                case _:
-                    busy[info.image] += 1
-        return View(
-            idle=tuple(idle),
-            busy=busy,
-            starting=starting,
-            memory_mb=self.books.memory_mb,
-            containers=len(self.books),
+        return glance(
+            self.books,
+            self.starts.costs,
             budget_mb=self._memory.squeeze.budget_mb,
             capacity=self._config.capacity,
-            blocked=frozenset(self.starts.problems(self._images)),
+            blocked=self.starts.problems(self._images),
         )
 
     def _room(self, memory_mb: int, *, for_run: bool) -> tuple[Retire, ...] | None:
@@ -468,3 +461,8 @@ class Keeper:
             if not facts.limits_enforced:
                 log.warning("limits of containers are not enforced here", cgroup=facts.cgroup_version)
         self._wake.set()
+
+
+def _hour(now: float) -> float:
+    """Return the hour of the day (UTC) at a reading of the monotonic clock: what people do follows it."""
+    return (time.time() - (time.monotonic() - now)) / 3600.0 % 24.0

@@ -25,6 +25,7 @@ from appliance.model import ContainerInfo, Need, Phase, RunEvent, RunRequest, Si
 from appliance.pool.container import PooledContainer
 from appliance.pool.conversation import Call
 from appliance.pool.engine import Engine, PodmanEngine
+from appliance.pool.experience import Keepsake, Store
 from appliance.pool.keeper import Keeper
 from appliance.pool.pressure import Reading
 from appliance.pool.running import Runs
@@ -55,6 +56,7 @@ class Pool:
         on_call: carries out what a handler asks of the appliance.
         on_change: told the facts of all containers whenever one of them changes.
         state: where state volumes and images of other gateways come from.
+        store: keeps what the pool learns over a restart; None: it begins anew each time.
         make_engine: Podman, unless a test says otherwise.
         read_memory: what the kernel says of memory, unless a test says otherwise.
 
@@ -76,6 +78,7 @@ class Pool:
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         state: State = ALONE,
+        store: Store | None = None,
         make_engine: Callable[[], Engine] | None = None,
         read_memory: Callable[[], Reading] | None = None,
     ) -> None:
@@ -112,6 +115,7 @@ class Pool:
             refused=self.refused,
             read_memory=read_memory,
         )
+        self._keepsake = Keepsake(store, recall=self._keeper.recall, tell=self._keeper.experience)
         self._runs = Runs(
             config,
             self._keeper,
@@ -157,6 +161,7 @@ class Pool:
 
     async def start(self) -> None:
         """Connect to Podman, adopt this gateway's containers, and warm up to the floor in the background."""
+        await self._keepsake.start()
         await self._keeper.start()
 
     async def drain(self, deadline_s: float) -> None:
@@ -167,6 +172,7 @@ class Pool:
     async def stop(self, *, keep_containers: bool) -> None:
         """Let go of everything; containers go on running, to be adopted, if they are to be kept."""
         self._keeper.draining = True
+        await self._keepsake.stop()
         await self._keeper.stop(keep_containers=keep_containers, patience_s=self._runs.patience_s)
 
     # --- selecting ------------------------------------------------------------------------------------------

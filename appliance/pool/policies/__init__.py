@@ -12,7 +12,7 @@ Inside: planner; evictor (the interface) with greedy_dual and least_recent behin
 from appliance.pool.policies.costs import ColdCosts
 from appliance.pool.policies.evictor import Evictor
 from appliance.pool.policies.facts import Idle, Retire, Start, View
-from appliance.pool.policies.planner import Planner
+from appliance.pool.policies.planner import Planner, PlannerState
 from appliance.pool.policies.quarantine import Quarantine
 
-__all__ = ["ColdCosts", "Evictor", "Idle", "Planner", "Quarantine", "Retire", "Start", "View"]
+__all__ = ["ColdCosts", "Evictor", "Idle", "Planner", "PlannerState", "Quarantine", "Retire", "Start", "View"]

@@ -1,6 +1,7 @@
 """What a cold start of an image costs on this gateway."""
 
 from collections import deque
+from collections.abc import Mapping
 
 
 class ColdCosts:
@@ -27,3 +28,13 @@ class ColdCosts:
     def usual_ms(self) -> float:
         """Return the mean over the images that were started here; the initial guess before any was."""
         return self._usual_ms
+
+    def state(self) -> dict[str, tuple[float, ...]]:
+        """Return what was measured, to be kept."""
+        return {image: tuple(seen) for image, seen in self._seen.items()}
+
+    def restore(self, state: Mapping[str, tuple[float, ...]]) -> None:
+        """Go on from what was measured before."""
+        for image, seen in state.items():
+            for took_ms in seen:
+                self.add(image, took_ms)

@@ -6,7 +6,9 @@ histogram of idle times a level says for the first, second, third … container 
 policies say for the only one.
 """
 
-from collections.abc import Set
+from collections.abc import Mapping, Set
+
+from msgspec import Struct
 
 from appliance.pool.policies.idle_times import IdleTimes
 
@@ -19,6 +21,15 @@ FADE = 0.2
 
 LOST_S = 60.0
 """A run that arrived so long ago and has no container waits no longer."""
+
+
+class DemandState(Struct, frozen=True, kw_only=True):
+    """What is known of the demand for one image, without the moments: those are of one process's clock."""
+
+    arrivals: int
+    service_s: float
+    gap_s: float
+    levels: tuple[dict[int, float], ...] = ()
 
 
 class ImageDemand:
@@ -68,6 +79,22 @@ class ImageDemand:
         silence_s = now - self.last
         return self._gap_s + FADE * (silence_s - self._gap_s) if silence_s > self._gap_s else self._gap_s
 
+    def state(self) -> DemandState:
+        """Return what is known, to be kept."""
+        levels = tuple(each.state() for each in self.levels)
+        return DemandState(arrivals=self.arrivals, service_s=self.service_s, gap_s=self._gap_s, levels=levels)
+
+    @classmethod
+    def restored(cls, state: DemandState, now: float) -> "ImageDemand":
+        """Return the demand that was kept; the time until `now` is taken for none."""
+        made = cls()
+        made.arrivals = max(0, state.arrivals)
+        made.last = now
+        made.service_s = max(0.0, state.service_s)
+        made._gap_s = max(0.0, state.gap_s)
+        made.levels = [IdleTimes.restored(each) for each in state.levels[:MAX_LEVELS]]
+        return made
+
     def idle_times(self, level: int) -> IdleTimes | None:
         """Return the histogram of a level (1 is the first), if there is one."""
         return self.levels[level - 1] if 0 < level <= len(self.levels) else None
@@ -105,3 +132,13 @@ class Demand:
             if demand.runs and image not in present and now - demand.last > LOST_S:
                 while demand.runs:
                     demand.ended(0.0, now)
+
+    def state(self) -> dict[str, DemandState]:
+        """Return what is known of all images, to be kept."""
+        return {image: each.state() for image, each in self.images.items()}
+
+    def restore(self, state: Mapping[str, DemandState], now: float) -> None:
+        """Go on from what was known; an image that was asked for since is left as it is."""
+        for image, each in list(state.items())[-MAX_IMAGES:]:
+            if image not in self.images:
+                self.images[image] = ImageDemand.restored(each, now)

@@ -6,6 +6,7 @@ the hour. Old counts fade: when there are 256 they are halved.
 """
 
 import math
+from collections.abc import Mapping
 
 FIRST_S = 0.25
 PER_OCTAVE = 8
@@ -61,6 +62,20 @@ class IdleTimes:
         if self.total >= FADE_AT:
             self.counts = [count / 2 for count in self.counts]
             self.total /= 2
+
+    def state(self) -> dict[int, float]:
+        """Return the counts by bucket, to be kept; empty buckets are left out."""
+        return {index: count for index, count in enumerate(self.counts) if count}
+
+    @classmethod
+    def restored(cls, state: Mapping[int, float]) -> "IdleTimes":
+        """Return the histogram of counts that were kept; buckets there are none of are left out."""
+        made = cls()
+        for index, count in state.items():
+            if 0 <= index < BUCKETS and 0 < count <= FADE_AT:
+                made.counts[index] = count
+        made.total = sum(made.counts)
+        return made
 
     def window(self) -> tuple[float, float] | None:
         """Return the 5th percentile, rounded down, and the 99th, rounded up, seconds; None: not representative."""

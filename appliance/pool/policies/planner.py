@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from appliance.model import PoolHint
 from appliance.pool.policies.costs import ColdCosts
-from appliance.pool.policies.demand import Demand
+from appliance.pool.policies.demand import Demand, DemandState
 from appliance.pool.policies.evictor import Evictor
 from appliance.pool.policies.facts import Idle, Retire, Start, View
 from appliance.pool.policies.forecaster import Forecaster, Level, Surety
@@ -49,6 +49,7 @@ class PlannerState(Struct, frozen=True, kw_only=True):
     """What the policies have learned, to survive a restart."""
 
     learned: LearnedState | None = None
+    demand: dict[str, DemandState] = {}
 
 
 class Planner:
@@ -123,10 +124,11 @@ class Planner:
 
     def state(self) -> PlannerState:
         """Return what was learned, to be kept."""
-        return PlannerState(learned=self._learned.state())
+        return PlannerState(learned=self._learned.state(), demand=self._demand.state())
 
-    def restore(self, state: PlannerState) -> None:
+    def restore(self, state: PlannerState, now: float) -> None:
         """Go on from what was learned before."""
+        self._demand.restore(state.demand, now)
         if state.learned is not None:
             self._learned.restore(state.learned)
 

@@ -213,7 +213,7 @@ def test_what_was_learned_survives_a_restart() -> None:
     assert state.learned is not None
     assert state.learned.seen > 50
     again = Planner(PoolConfig(floor={}), ColdCosts(500.0), SIZES.__getitem__)
-    again.restore(msgspec.json.decode(msgspec.json.encode(state), type=PlannerState))
+    again.restore(msgspec.json.decode(msgspec.json.encode(state), type=PlannerState), 1000.0)
     assert again.state() == state
-    again.restore(PlannerState(learned=msgspec.structs.replace(state.learned, weights=(1.0,))))
+    again.restore(PlannerState(learned=msgspec.structs.replace(state.learned, weights=(1.0,))), 1000.0)
     assert again.state() == state
