@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import structlog
+from msgspec import Struct
 
 from appliance.errors import ConfigError, UnreachableError
 from appliance.plane.bounded import BoundedMembership
@@ -25,6 +26,23 @@ from appliance.plane.store import Store
 log = structlog.get_logger(__name__)
 
 STORE_FILE = "gateway.sqlite"
+
+
+MOST_ASKED = 3
+ASK_TIMEOUT_S = 0.5
+"""One that is busy for longer is no help: what is linked directly counts then."""
+
+
+class MemberAsk(Struct, frozen=True):
+    """`member`: do you see a gateway of this name?"""
+
+    gateway: str
+
+
+class Member(Struct, frozen=True):
+    """The answer."""
+
+    here: bool
 
 
 class Plane:
@@ -52,6 +70,7 @@ class Plane:
             dht=self.dht,
             pulse=self._pulse,
         )
+        self.rpc.register("member", MemberAsk, self._on_member, exchange=False)
         self.on_member_lost: list[Callable[[str], None]] = self._membership.on_lost
 
     @classmethod
@@ -109,13 +128,25 @@ class Plane:
 
     async def _taken(self) -> bool:
         """Whether another process shows our token; one that was killed may do so for a lease."""
-        key = self.keys.alive(self.gateway)
         until = asyncio.get_running_loop().time() + 2 * self.config.lease_ms / 1e3
-        while await self.session.alive_now(key):
+        while await self.session.alive_now(self.keys.alive(self.gateway)) or await self._known_to_others():
             if asyncio.get_running_loop().time() > until:
                 return True
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.02)
         return False
+
+    async def _known_to_others(self) -> bool:
+        """Whether gateways that are linked already see one of our name to which we have no link yet."""
+        others = [name for name in await self._present() if name != self.gateway][:MOST_ASKED]
+        ask = MemberAsk(gateway=self.gateway)
+        answers = await asyncio.gather(
+            *(self.rpc.call(name, "member", ask, Member, timeout_s=ASK_TIMEOUT_S) for name in others),
+            return_exceptions=True,
+        )
+        return any(isinstance(answer, Member) and answer.here for answer in answers)
+
+    async def _on_member(self, ask: MemberAsk) -> Member:
+        return Member(here=check_name(ask.gateway, "gateway") in self._membership.members)
 
     async def _present(self) -> list[str]:
         return [key.split("/")[-2] for key in await self.session.alive_now(self.keys.alive())]

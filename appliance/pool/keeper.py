@@ -85,7 +85,7 @@ class Keeper:
             config, starter=self._starter, link=self.link, decisions=self.decisions, on_end=self._on_started
         )
         self._planner = Planner(
-            config, self.starts.costs, lambda image: self._starter.size(image).memory_mb, hour=_hour
+            config.baseline(), self.starts.costs, lambda image: self._starter.size(image).memory_mb, hour=_hour
         )
         self._memory = MemoryWatch(
             config.pressure,

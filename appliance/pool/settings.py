@@ -3,6 +3,7 @@
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
+from msgspec.structs import replace
 
 from appliance.pool.transfer.settings import TransferConfig
 
@@ -46,12 +47,18 @@ class PressureConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """What the pool may always hold: two ordinary containers, so that work goes on however slowly."""
 
 
+PAPER_IDLE_S = 600.0
+"""The paper's keep-alive."""
+
+
 class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of one gateway's pool."""
 
     mode: Literal["cold", "local", "federated"] = "federated"
     """`cold`: a fresh container for every run, removed afterwards (the baseline to measure against). `local`: warm
-    containers of this gateway only. `federated`: those of other gateways too."""
+    containers of this gateway only, as in the paper: kept for ten minutes after their last run, the longest idle one
+    given up first, none started ahead but the floor; `prewarm`, `keep`, `eviction` and `idle_s` are not looked at.
+    `federated`: those of other gateways too, and all policies."""
     capacity: Annotated[int, Meta(ge=1, le=256)] = 8
     """Containers at most; each has a process (8 to 30 MB) and a conmon (2 MB) of its own."""
     memory_mb: Annotated[int, Meta(ge=64)] = 4096
@@ -136,3 +143,9 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     pressure: PressureConfig = field(default_factory=PressureConfig)
     transfer: TransferConfig = field(default_factory=TransferConfig)
     """How volumes and images come from other gateways."""
+
+    def baseline(self) -> "PoolConfig":
+        """Return the settings that the policies are to go by: with mode `local` those of the paper."""
+        if self.mode != "local":
+            return self
+        return replace(self, prewarm=(), keep="fixed", eviction="lru", idle_s=PAPER_IDLE_S)

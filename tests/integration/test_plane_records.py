@@ -348,7 +348,7 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
     plane = fleet.planes[0]
     foreign = await Session.open(PlaneConfig(mode="client", connect=(fleet.endpoints[0],)), "f")
     verbs = sorted(plane.rpc._verbs)
-    assert verbs == ["dht_digest", "dht_fetch", "dht_read", "dht_store", "dht_write", "facts"]
+    assert verbs == ["dht_digest", "dht_fetch", "dht_read", "dht_store", "dht_write", "facts", "member"]
     impossible = {
         "dht_read": [{"key": ""}],
         "dht_write": [{"key": "", "value": ""}, {"key": "k", "expected": {"g": 0}}, {"key": "k", "value": "&"}],
@@ -356,6 +356,7 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
         "dht_fetch": [{"keys": ["k"] * 5000}],
         "dht_digest": [{"asker": "A/*"}],
         "facts": [],
+        "member": [{"gateway": "A/*"}],
     }
     for verb in verbs:
         key = plane.keys.rpc("g0", verb)

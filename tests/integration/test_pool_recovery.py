@@ -256,4 +256,4 @@ async def test_an_image_deleted_under_the_pool(bench: Bench) -> None:
         for each in bench.pools:
             await each.stop(keep_containers=False)
     finally:
-        await asyncio.create_subprocess_exec("podman", "rmi", "--ignore", mine, stdout=asyncio.subprocess.DEVNULL)
+        await _command("podman", "rmi", "--ignore", mine)

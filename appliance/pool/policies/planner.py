@@ -23,7 +23,7 @@ from appliance.pool.policies.evictor import Evictor
 from appliance.pool.policies.facts import Idle, Retire, Start, View
 from appliance.pool.policies.forecaster import Forecaster, Level, Surety
 from appliance.pool.policies.greedy_dual import GreedyDual
-from appliance.pool.policies.hints import PlanHints
+from appliance.pool.policies.hints import OPERATOR, PlanHints
 from appliance.pool.policies.histogram import Histogram
 from appliance.pool.policies.keeping import KeepFixed, KeepHistogram, Keeping, KeepWorth
 from appliance.pool.policies.learned import Learned, LearnedState
@@ -77,10 +77,13 @@ class Planner:
         self._size_mb = size_mb
         self._demand = Demand()
         self._hints = PlanHints()
+        self._wishes = PlanHints()
+        """Of operators: they are met whatever `prewarm` says."""
         histogram = Histogram(self._demand)
         rate = Rate(self._demand, hit_target=settings.hit_target, horizon_s=settings.idle_s)
         known: dict[str, Forecaster] = {"hints": self._hints, "histogram": histogram, "rate": rate}
-        self._forecasters = [each for name, each in known.items() if name in settings.prewarm]
+        chosen = [each for name, each in known.items() if name in settings.prewarm]
+        self._forecasters: list[Forecaster] = [self._wishes, *chosen]
         self._learned = Learned(self._demand, next_hint_s=self._hints.next_s, hour=hour)
         fixed = KeepFixed(settings.idle_s)
         sharp = histogram if "histogram" in settings.prewarm else None
@@ -116,7 +119,7 @@ class Planner:
 
     def hinted(self, hint: PoolHint, now: float) -> None:
         """Note what a plan, or an operator, will need."""
-        self._hints.hinted(hint, now)
+        (self._wishes if hint.task == OPERATOR else self._hints).hinted(hint, now)
 
     def evicted(self, idle: Idle, now: float) -> None:
         """Note that a container that `room` named was given up. What `tend` orders is noted already."""

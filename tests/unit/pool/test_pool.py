@@ -285,7 +285,7 @@ async def test_used_up_containers_are_replaced(bench: Any) -> None:
 
 async def test_idle_ones_beyond_the_floor_go(bench: Any) -> None:
     """A container that nobody has used for long is removed, down to the floor."""
-    pool = await bench.pool(floor={"base": 1}, idle_s=0.3)
+    pool = await bench.pool(mode="federated", keep="fixed", prewarm=(), floor={"base": 1}, idle_s=0.3)
     await bench.ready(pool, 1)
     await asyncio.gather(*(bench.run(pool, bench.request(number)) for number in range(3)))
     await bench.until(lambda: len(pool.containers()) == 1, "back to the floor")

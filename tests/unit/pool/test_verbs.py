@@ -104,7 +104,7 @@ async def test_release_quarantine(bench: Any) -> None:
 
 async def test_hint(bench: Any) -> None:
     """What another gateway's plan will need is warmed; hints of nonsense are refused and counted."""
-    pool = await bench.pool()
+    pool = await bench.pool(mode="federated")
     assert (await pool.verbs.hint(PoolHint(image="base", in_s=1.0, keep_s=10.0))).taken
     await bench.ready(pool, 1)
     with pytest.raises(NotFoundError):

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from appliance.model import PoolHint
 from appliance.pool.policies import ColdCosts, Idle, Planner, View
 from appliance.pool.policies.greedy_dual import GreedyDual
+from appliance.pool.policies.hints import OPERATOR
 from appliance.pool.policies.planner import PlannerState, missing, victims
 from appliance.pool.settings import PoolConfig
 
@@ -217,3 +218,30 @@ def test_what_was_learned_survives_a_restart() -> None:
     assert again.state() == state
     again.restore(PlannerState(learned=msgspec.structs.replace(state.learned, weights=(1.0,))), 1000.0)
     assert again.state() == state
+
+
+def test_the_papers_baseline() -> None:
+    """Mode `local` keeps for ten minutes, gives up the longest idle, and starts nothing ahead, whatever else is set."""
+    config = PoolConfig(mode="local", floor={}, idle_s=5.0).baseline()
+    planner = Planner(config, ColdCosts(500.0), SIZES.__getitem__)
+    planner.hinted(PoolHint(image="base", count=2), 0.0)
+    idle = tuple(Idle(id=f"i{age}", image="base", memory_mb=128, runs=1, cold_ms=500.0, since=age) for age in (0, 50))
+    view = View(idle=idle, memory_mb=256, containers=2, budget_mb=256, capacity=2)
+    assert planner.tend(view, 599.0) == ((), ())
+    starts, retirements = planner.tend(view, 601.0)
+    assert not starts
+    assert [each.id for each in retirements] == ["i0"]
+    room = planner.room(view, 128, 100.0, for_run=True)
+    assert room is not None
+    assert [each.id for each in room] == ["i0"]
+    assert PoolConfig(idle_s=5.0).baseline() == PoolConfig(idle_s=5.0)
+
+
+def test_an_operators_wish_is_met_whatever_is_set() -> None:
+    """What an operator wants warm is started and kept until its time, also where nothing is started ahead."""
+    planner = Planner(PoolConfig(floor={}, prewarm=()), ColdCosts(500.0), SIZES.__getitem__)
+    planner.hinted(PoolHint(image="base", count=1, keep_s=60.0, task=OPERATOR), 0.0)
+    empty = View(idle=(), memory_mb=0, containers=0, budget_mb=1024, capacity=4)
+    (start,), _ = planner.tend(empty, 1.0)
+    assert start.image == "base"
+    assert planner.tend(empty, 61.0) == ((), ())
