@@ -29,6 +29,10 @@ file of 14 bytes on a loaded machine: 50 to 80 ms to the first line of the handl
 EMPTY_OFFERS = 3
 """Offers in a row that were nothing, after which a gateway is left out; one or two are lost races."""
 LEFT_OUT_S = 10.0
+"""For how long at most: it doubles with each further offer that is nothing, and one that is good ends it."""
+FIRST_LEFT_OUT_S = 0.25
+"""At first. Under load races are lost in rows: gateways with room that are left out for seconds leave a busy one
+alone with its queue (80 runs/s, uneven: runs refused here while others stand idle)."""
 
 
 class Links(Protocol):
@@ -179,7 +183,8 @@ class RemoteContainers:
         trust = self._trust.setdefault(gateway, _Trust())
         trust.empty += 1
         if trust.empty >= EMPTY_OFFERS:
-            trust.until = now() + LEFT_OUT_S
+            doublings = min(trust.empty - EMPTY_OFFERS, 16)
+            trust.until = now() + min(LEFT_OUT_S, FIRST_LEFT_OUT_S * 2**doublings)
 
     def _forget(self, gateway: str) -> None:
         self._round_trip_ms.pop(gateway, None)

@@ -268,9 +268,10 @@ async def test_liars_all_around_end_in_a_cold_start_here(executor: Executor, pla
 
 
 async def test_a_gateway_whose_offers_are_nothing_again_and_again_is_left_out(
-    executor: Executor, plane: Any, pool: Any
+    executor: Executor, plane: Any, pool: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three in a row, and it is not asked for a while; a good one in between begins anew."""
+    monkeypatch.setattr("appliance.tasks.remote.FIRST_LEFT_OUT_S", 10.0)  # or a slow machine is too late to see it
     refuse = True
 
     async def answer(gateway: str, request: RunRequest) -> RunAccepted:

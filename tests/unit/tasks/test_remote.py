@@ -6,7 +6,14 @@ import pytest
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, VolumeInfo
 from appliance.tasks.api import ContainerList
-from appliance.tasks.remote import BRING_MS, EMPTY_OFFERS, LEFT_OUT_S, RemoteContainers, UnmeasuredLinks
+from appliance.tasks.remote import (
+    BRING_MS,
+    EMPTY_OFFERS,
+    FIRST_LEFT_OUT_S,
+    LEFT_OUT_S,
+    RemoteContainers,
+    UnmeasuredLinks,
+)
 
 pytestmark = pytest.mark.anyio
 
@@ -102,6 +109,10 @@ async def test_empty_offers_leave_a_gateway_out_for_a_while(remote: RemoteContai
     assert remote.left_out(lambda: now) == {}
     remote.turned_out("gw-2", good=False, now=lambda: now)
     assert set(remote.left_out(lambda: now)) == {"gw-2"}
+    assert remote.left_out(lambda: now + FIRST_LEFT_OUT_S) == {}
+    for _ in range(20):  # one that goes on offering nothing is left out for longer and longer, up to a bound
+        remote.turned_out("gw-2", good=False, now=lambda: now)
+    assert set(remote.left_out(lambda: now + LEFT_OUT_S - 0.1)) == {"gw-2"}
     assert remote.left_out(lambda: now + LEFT_OUT_S) == {}
     for callback in plane.on_member_lost:
         callback("gw-2")
