@@ -30,11 +30,11 @@ test: ## Set up and run everything: lint, types, import contracts, unit, integra
 	$(PYTEST) tests
 
 # Types and tests take longest, and neither needs the other: at the same time.
-check: ready ## The fast part: lint, types, import contracts, unit tests
+check: ready ## The fast part: lint, types, import contracts, unit tests with few examples of each property
 	$(MAKE) --no-print-directory lint formatted contracts READY=1
 	report=$$(mktemp); trap 'rm -f "$$report"' EXIT; failed=0; \
 	$(RUN) basedpyright --level error >"$$report" 2>&1 & types=$$!; \
-	$(PYTEST) tests/unit || failed=$$?; \
+	SWIFTBOT_QUICK=1 $(PYTEST) --numprocesses 4 tests/unit || failed=$$?; \
 	wait "$$types" || { cat "$$report" >&2; failed=1; }; \
 	exit "$$failed"
 

@@ -24,6 +24,21 @@ ROOT = Path(__file__).resolve().parent.parent
 """The project's root folder."""
 
 
+FEW_EXAMPLES = 10
+"""Of each property, when quick feedback is wanted (SWIFTBOT_QUICK=1, as `make check` does)."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Try fewer examples of each property where quick feedback is wanted; the whole run tries all."""
+    if not os.environ.get("SWIFTBOT_QUICK"):
+        return
+    for item in items:
+        test = getattr(item, "obj", None)
+        chosen = getattr(test, "_hypothesis_internal_use_settings", None)
+        if isinstance(chosen, settings) and chosen.max_examples > FEW_EXAMPLES:
+            test._hypothesis_internal_use_settings = settings(chosen, max_examples=FEW_EXAMPLES)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]:
     """End an async test that waits in vain within the loop, a little before its time limit.
