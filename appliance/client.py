@@ -234,7 +234,8 @@ class FleetClient:
             queue.put_nowait(await self.task(task))
             while last is None or not last.state.final:
                 try:
-                    record = await asyncio.wait_for(queue.get(), timeout=poll_s)
+                    async with asyncio.timeout(poll_s):
+                        record = await queue.get()
                 except TimeoutError:
                     try:
                         record = await self.task(task)
@@ -261,7 +262,8 @@ class FleetClient:
             raise DeadlineError(f"task {task} has no plan yet")
 
         try:
-            return await asyncio.wait_for(wait(), timeout_s)
+            async with asyncio.timeout(timeout_s):
+                return await wait()
         except TimeoutError:
             raise DeadlineError(
                 f"task {task} has no plan after {timeout_s:.0f} s", remedy=f"see `swiftbot task show {task}`"

@@ -347,7 +347,8 @@ class Gateway:
     async def _keep_publishing(self) -> None:
         while True:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), timeout=self.config.status_s)
+                async with asyncio.timeout(self.config.status_s):
+                    await self._changed.wait()
             self._changed.clear()
             try:
                 self._publish_status()

@@ -142,7 +142,8 @@ async def _other(
     finally:
         stdin.close()
         try:
-            await asyncio.wait_for(process.wait(), 20.0)
+            async with asyncio.timeout(20.0):
+                await process.wait()
         except TimeoutError:
             process.kill()
             await process.wait()

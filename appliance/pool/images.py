@@ -158,11 +158,13 @@ async def _run(what: str, command: Sequence[str], progress: Progress, *, remedy:
         return await process.wait()
 
     try:
-        status = await asyncio.wait_for(follow(), BUILD_TIMEOUT_S)
+        async with asyncio.timeout(BUILD_TIMEOUT_S):
+            status = await follow()
     except (TimeoutError, asyncio.CancelledError) as error:
         process.terminate()
         try:
-            await asyncio.wait_for(process.wait(), 10.0)
+            async with asyncio.timeout(10.0):
+                await process.wait()
         except TimeoutError:
             process.kill()
         if isinstance(error, asyncio.CancelledError):

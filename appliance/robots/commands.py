@@ -231,7 +231,8 @@ class CommandDesk:
 
     async def _join(self, running: _Running) -> RobotReply:
         try:
-            reply = await asyncio.wait_for(asyncio.shield(running.reply), LONG_POLL_S)
+            async with asyncio.timeout(LONG_POLL_S):
+                reply = await asyncio.shield(running.reply)
         except TimeoutError:
             raise DeadlineError(f"{running.command.verb} is still under way", remedy="ask again, same id") from None
         if reply is None:

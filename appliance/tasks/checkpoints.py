@@ -150,7 +150,8 @@ class Checkpoints:
             run.newest = None
             return
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(run.writer, LAST_S)
+            async with asyncio.timeout(LAST_S):
+                await run.writer
 
     async def _keep_writing(self, key: tuple[str, str, int], run: _Run) -> None:
         """Write the newest one, again and again, until the run has ended or nothing came for a while."""
@@ -161,7 +162,8 @@ class Checkpoints:
             except SwiftbotError as error:
                 log.warning("a checkpoint could not be kept", task=event.task, subtask=event.subtask, reason=str(error))
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(run.hurry.wait(), EVERY_S)
+                async with asyncio.timeout(EVERY_S):
+                    await run.hurry.wait()
         run.writer = None
         if run.hurry.is_set() or run.outdated:
             self._runs.pop(key, None)

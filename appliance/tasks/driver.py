@@ -127,7 +127,8 @@ class Driver(Keeper):
 
     async def _next(self) -> Input:
         try:
-            return await asyncio.wait_for(self._inbox.get(), timeout=self._pause_s())
+            async with asyncio.timeout(self._pause_s()):
+                return await self._inbox.get()
         except TimeoutError:
             return Wake()
 

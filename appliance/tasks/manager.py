@@ -262,7 +262,8 @@ class TaskManager:
         """
         while True:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._sweep.wait(), timeout=SWEEP_S)
+                async with asyncio.timeout(SWEEP_S):
+                    await self._sweep.wait()
             self._sweep.clear()
             try:
                 await self._take_up()

@@ -78,7 +78,8 @@ async def _acknowledgement(answers: asyncio.Queue[Message], number: int, timeout
     deadline = loop.time() + timeout_s
     while True:
         try:
-            answer = await asyncio.wait_for(answers.get(), max(deadline - loop.time(), 0.0))
+            async with asyncio.timeout(max(deadline - loop.time(), 0.0)):
+                answer = await answers.get()
         except TimeoutError:
             return None
         if answer.command != number:
@@ -114,7 +115,8 @@ async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience)
         _send_count(vehicle, items)
         while silent < patience.tries:
             try:
-                answer = await asyncio.wait_for(answers.get(), patience.timeout_s)
+                async with asyncio.timeout(patience.timeout_s):
+                    answer = await answers.get()
             except TimeoutError:
                 silent += 1
                 if last is None:

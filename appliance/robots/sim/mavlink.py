@@ -119,7 +119,8 @@ class Simulation:
                         self._due[name] = max(self._due[name] + interval, now)
                         self._send([telemetry(self.copter, name, round((now - began) * 1000))])
                 try:
-                    await asyncio.wait_for(stop.wait(), TICK_S)
+                    async with asyncio.timeout(TICK_S):
+                        await stop.wait()
                 except TimeoutError:
                     continue
         finally:

@@ -101,7 +101,8 @@ async def _connect(settings: RobotSettings, stop: asyncio.Event) -> Session | No
         except UnreachableError as error:
             log.info("waiting for a gateway", robot=settings.name, reason=error.message)
             try:
-                await asyncio.wait_for(stop.wait(), _RETRY_S)
+                async with asyncio.timeout(_RETRY_S):
+                    await stop.wait()
             except TimeoutError:
                 continue
     return None
@@ -172,7 +173,8 @@ class Rover:
                 told = now
                 self._session.put(self._session.keys.robot(self.name), encode(self.info()))
             try:
-                await asyncio.wait_for(stop.wait(), TICK_S)
+                async with asyncio.timeout(TICK_S):
+                    await stop.wait()
             except TimeoutError:
                 continue
 
