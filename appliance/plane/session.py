@@ -166,11 +166,23 @@ class Session:
         closer = Closer(subscriber.undeclare)
         return closer
 
-    def subscribe_typed(self, expr: str, kind: type[T], callback: Callable[[str, T | None], None]) -> Closer:
-        """Have facts delivered decoded, None when one is deleted; malformed ones are counted, logged, dropped."""
+    def subscribe_typed(
+        self,
+        expr: str,
+        kind: type[T],
+        callback: Callable[[str, T | None], None],
+        *,
+        wanted: Callable[[str], bool] = lambda _: True,
+    ) -> Closer:
+        """Have facts delivered decoded, None when one is deleted; malformed ones are counted, logged, dropped.
+
+        Those whose key is not `wanted` are not even decoded.
+        """
         decoder, name = msgspec.json.Decoder(kind), self._name(expr)
 
         def take(message: Message) -> None:
+            if not wanted(message.key):
+                return
             if message.deleted:
                 callback(message.key, None)
                 return

@@ -81,7 +81,7 @@ class ZenohTaskClient:
                 except queue.Empty:
                     record = self._look(task)
                 sequence = int(record.get("sequence", 0))
-                if sequence > last:
+                if record and sequence > last:  # what is no record, or not found, tells nothing
                     last = sequence
                     yield record
                     if record.get("state") in FINAL:

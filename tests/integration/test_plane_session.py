@@ -99,6 +99,22 @@ async def test_bad_facts_are_counted_and_dropped(pair: tuple[Session, Session]) 
     assert other.refused == {"malformed gw/*/log": len(bad), "oversize gw/*/log": 1}
 
 
+async def test_facts_that_nobody_wants_are_not_decoded(pair: tuple[Session, Session]) -> None:
+    """What is not wanted by its key is neither delivered nor refused, whatever it says."""
+    one, other = pair
+    seen: list[str] = []
+    other.subscribe_typed(
+        other.keys.log(), LogLine, lambda key, _: seen.append(key), wanted=lambda key: key.endswith("/b/log")
+    )
+    await _heard(one, other)
+    good = encode(LogLine(at_ns=1, level="info", source="s", event="e"))
+    for gateway, payload in (("a", good), ("a", b"{"), ("b", good), ("a", good), ("b", good)):
+        one.put(one.keys.log(gateway), payload)
+    await _until(lambda: len(seen) == 2)
+    assert {key.split("/")[-2] for key in seen} == {"b"}
+    assert other.refused == {}
+
+
 async def test_a_flood_is_bounded_and_counted(free_port: int) -> None:
     """What comes in faster than the loop takes it is dropped beyond the bound and counted; afterwards all is well."""
     endpoint = f"tcp/127.0.0.1:{free_port}"

@@ -136,6 +136,10 @@ class LetterDesk:
                 )
                 del sender.channel.failed[number]
 
+    def follows(self, task: str) -> bool:
+        """Whether somebody is told how this task goes on."""
+        return task in self._followed
+
     def news(self, record: TaskRecord) -> None:
         """Tell a task's sender how it goes on."""
         found = self._followed.get(record.id)

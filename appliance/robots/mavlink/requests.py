@@ -41,6 +41,10 @@ PREFIX = "mavlink/request/"
 """Of the senders' last requests in the gateway's store."""
 MAX_SENDERS = 64
 """Whose last request is remembered; the longest silent is forgotten first."""
+MAX_AT_WORK = 16
+"""Requests being carried out at once, of different senders."""
+MAX_FOLLOWED = 1000
+"""Tasks whose senders are told how they go on; the oldest is forgotten first."""
 _TEXT = 50
 """Characters of a STATUSTEXT."""
 _INFO, _NOTICE, _ERROR = 6, 5, 3
@@ -55,6 +59,14 @@ class Asked(Struct, kw_only=True):
     task: str
     result: int | None = None
     why: str = ""
+
+
+class _Work(Struct, frozen=True, kw_only=True):
+    """What is being carried out for a sender."""
+
+    command: int
+    parameters: tuple[float, ...]
+    running: asyncio.Task[None]
 
 
 def task_number(task: str) -> int:
@@ -111,8 +123,9 @@ class RequestDesk:
         self._store = store
         self._refused = refused
         self._last: OrderedDict[str, Asked] = OrderedDict()
-        self._at_work: dict[str, asyncio.Task[None]] = {}
-        self._follow: dict[str, tuple[Callable[[Message], None], str]] = {}
+        self._at_work: dict[str, _Work] = {}
+        self._followed: OrderedDict[str, tuple[Callable[[Message], None], str]] = OrderedDict()
+        """Task -> how its sender is told, and what was told last."""
 
     async def load(self) -> None:
         """Read what was asked for before a restart."""
@@ -125,9 +138,10 @@ class RequestDesk:
 
     async def close(self) -> None:
         """Stop; what is being handed in is asked again by its sender."""
-        for task in list(self._at_work.values()):
+        running = [each.running for each in self._at_work.values()]
+        for task in running:
             task.cancel()
-        await asyncio.gather(*self._at_work.values(), return_exceptions=True)
+        await asyncio.gather(*running, return_exceptions=True)
 
     def take(self, frame: Frame, *, robot: str, reply: Callable[[Message], None]) -> None:
         """Take a command that is for this gateway.
@@ -143,24 +157,33 @@ class RequestDesk:
             self._count("command_unsupported")
             self._answer(frame, reply, dialect.UNSUPPORTED)
             return
-        if sender in self._at_work:
-            # A repetition while it is being handed in hears the same; anything else has to wait its turn.
-            same = message.command == ASK and self._last[sender].parameters == parameters_of(message)
+        parameters = parameters_of(message)
+        at_work = self._at_work.get(sender)
+        if at_work is not None:
+            # A repetition while it is being carried out hears the same; anything else has to wait its turn.
+            same = (at_work.command, at_work.parameters) == (message.command, parameters)
             self._answer(frame, reply, dialect.IN_PROGRESS if same else dialect.TEMPORARILY_REJECTED)
             return
         last = self._last.get(sender)
-        repeated = bool(getattr(message, "confirmation", 0)) and last is not None
-        if message.command == ASK and repeated and last is not None and last.parameters == parameters_of(message):
-            if last.result is not None:
-                self._reply(frame, reply, last)
-                return
-            work = self._hand_in(sender, frame, reply, last, robot)  # a gateway before this one did not come to answer
+        repeated = message.command == ASK and bool(getattr(message, "confirmation", 0))
+        again = last if repeated and last is not None and last.parameters == parameters else None
+        if again is not None and again.result is not None:
+            self._reply(frame, reply, again)
+            return
+        if len(self._at_work) >= MAX_AT_WORK:
+            self._count("mavlink_request_rejected")
+            self._say(reply, f"{MAX_AT_WORK} requests are being carried out: ask again", _NOTICE)
+            self._answer(frame, reply, dialect.TEMPORARILY_REJECTED)
+            return
+        if again is not None:
+            work = self._hand_in(sender, frame, reply, again, robot)  # a gateway before this one did not come to answer
         elif message.command == ASK:
             work = self._begin(sender, frame, reply, robot)
         else:
             work = self._cancel(frame, reply, last)
-        self._at_work[sender] = task = asyncio.create_task(work, name=f"MAVLink request of {sender}")
-        task.add_done_callback(lambda _: self._at_work.pop(sender, None))
+        running = asyncio.create_task(work, name=f"MAVLink request of {sender}")
+        self._at_work[sender] = _Work(command=message.command, parameters=parameters, running=running)
+        running.add_done_callback(lambda _: self._at_work.pop(sender, None))
 
     # --- asking ------------------------------------------------------------------------------------------------
 
@@ -181,7 +204,7 @@ class RequestDesk:
             request = self._request(asked, robot=robot, sender=sender)
             # Kept before it is handed in: whoever repeats it after a crash here asks for the same task.
             await self._store.put(PREFIX + sender, encode(asked))
-            self._follow[asked.task] = (reply, "")
+            self._follow(asked.task, reply)
             if self._tasks is None:
                 raise PayloadError("this gateway takes no tasks")
             await self._tasks.submit(request)
@@ -191,7 +214,7 @@ class RequestDesk:
             passing = isinstance(error, _PASSING)
             asked.result = dialect.TEMPORARILY_REJECTED if passing else dialect.DENIED
             asked.why = error.message
-            self._follow.pop(asked.task, None)
+            self._followed.pop(asked.task, None)
             self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
             log.warning("task by MAVLink is refused", sender=sender, reason=str(error))
         try:
@@ -235,9 +258,18 @@ class RequestDesk:
 
     # --- telling -----------------------------------------------------------------------------------------------
 
+    def follows(self, task: str) -> bool:
+        """Whether somebody is told how this task goes on."""
+        return task in self._followed
+
+    def _follow(self, task: str, reply: Callable[[Message], None]) -> None:
+        self._followed[task] = (reply, "")
+        while len(self._followed) > MAX_FOLLOWED:
+            self._followed.popitem(last=False)
+
     def news(self, record: TaskRecord) -> None:
         """Tell a task's sender how it goes on: its state, how many subtasks are done, and in the end why."""
-        found = self._follow.get(record.id)
+        found = self._followed.get(record.id)
         if found is None:
             return
         reply, told = found
@@ -250,9 +282,9 @@ class RequestDesk:
         if text != told:
             severity = _ERROR if record.state is TaskState.FAILED else _NOTICE if record.state.final else _INFO
             self._say(reply, text, severity)
-            self._follow[record.id] = (reply, text)
+            self._followed[record.id] = (reply, text)
         if record.state.final:
-            del self._follow[record.id]
+            del self._followed[record.id]
 
     def _reply(self, frame: Frame, reply: Callable[[Message], None], asked: Asked) -> None:
         if asked.why:

@@ -118,7 +118,9 @@ class Station:
             await self.stop()
             raise
         await self._requests.load()
-        self._records = self._session.subscribe_typed(self._session.keys.task(), TaskRecord, self._on_record)
+        self._records = self._session.subscribe_typed(
+            self._session.keys.task(), TaskRecord, self._on_record, wanted=self._follows
+        )
         self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
         self._ticking = asyncio.create_task(self._tick(), name="robot hub")
 
@@ -216,6 +218,11 @@ class Station:
 
         (self._letters if tunnel else self._requests).take(frame, robot=robot, reply=reply)
         return True
+
+    def _follows(self, key: str) -> bool:
+        """Whether anybody here is told of a record: most are of other gateways' business, and large."""
+        task = key.split("/")[-2]
+        return self._requests.follows(task) or self._letters.follows(task)
 
     def _on_record(self, key: str, record: TaskRecord | None) -> None:
         del key

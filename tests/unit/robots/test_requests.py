@@ -10,7 +10,7 @@ from appliance.errors import ConfigError, RefusedError, SwiftbotError
 from appliance.model import Failure, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.requests import RequestDesk, task_number
+from appliance.robots.mavlink.requests import MAX_AT_WORK, RequestDesk, task_number
 from appliance.robots.qgc import actions
 from appliance.robots.settings import RobotsConfig, Template
 from tests.unit.robots.conftest import FakeStore
@@ -56,7 +56,9 @@ class Fleet:
         self.cancelled.append(task)
         return TaskRecord(id=task, instruction="", state=TaskState.CANCELLING)
 
-    def send(self, *, robot: str = "drone_1", name: str = "COMMAND_LONG", **fields: Any) -> None:
+    def send(
+        self, *, robot: str = "drone_1", name: str = "COMMAND_LONG", source: tuple[int, int] = (255, 190), **fields: Any
+    ) -> None:
         """Send a command."""
         numbers = {f"param{number}": 0.0 for number in range(1, 8)}
         if name == "COMMAND_INT":
@@ -65,7 +67,7 @@ class Fleet:
         else:
             numbers["confirmation"] = 0
         common = {"target_system": 1, "target_component": 191, "command": 31010}
-        (frame,) = Codec(245, 191).read(Codec(255, 190).pack(make(name, **(common | numbers | fields))))
+        (frame,) = Codec(245, 191).read(Codec(*source).pack(make(name, **(common | numbers | fields))))
         assert isinstance(frame, Frame)
         self.desk.take(frame, robot=robot, reply=self.said.append)
 
@@ -198,6 +200,39 @@ async def test_cancelling(fleet: Fleet) -> None:
     await fleet.answered(5)
     assert fleet.cancelled == [fleet.submitted[0].id]
     assert fleet.acks[-1] == (ACCEPTED, task_number(fleet.submitted[0].id))
+
+
+async def test_two_commands_in_one_burst(fleet: Fleet) -> None:
+    """A second command before the first has begun hears that it has to wait, also one that repeats a cancel."""
+    fleet.gate.clear()
+    fleet.send(param1=1.0)
+    fleet.send(param1=1.0, confirmation=1)
+    fleet.send(param1=2.0, param2=5.0)
+    fleet.gate.set()
+    await fleet.answered(4)
+    assert sorted(result for result, _ in fleet.acks) == [ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS, IN_PROGRESS]
+    fleet.said.clear()
+    fleet.send(command=31011)
+    fleet.send(command=31011, confirmation=1)
+    fleet.send(param1=1.0)
+    await fleet.answered(4)
+    assert sorted(result for result, _ in fleet.acks) == [ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS, IN_PROGRESS]
+    assert len(fleet.submitted) == len(fleet.cancelled) == 1
+
+
+async def test_a_crowd_of_senders(fleet: Fleet) -> None:
+    """Beyond a bound of requests at work the next senders are told to ask again, and are counted; nobody is lost."""
+    fleet.gate.clear()
+    for system in range(1, MAX_AT_WORK + 4):
+        fleet.send(param1=1.0, source=(system, 190))
+    await fleet.answered(MAX_AT_WORK + 3)
+    assert [result for result, _ in fleet.acks].count(TEMPORARILY_REJECTED) == 3
+    assert fleet.refused == {"mavlink_request_rejected": 3}
+    fleet.gate.set()
+    await fleet.answered(2 * MAX_AT_WORK + 3)
+    assert len(fleet.submitted) == MAX_AT_WORK
+    assert all(fleet.desk.follows(each.id) for each in fleet.submitted)
+    assert not fleet.desk.follows("t-another")
 
 
 async def test_how_it_goes_on_is_told(fleet: Fleet) -> None:
