@@ -384,8 +384,9 @@ def retry_delay_s(attempt: int) -> float:
 def gives_up(target: SubtaskRecord, failure: Failure, *, retries: int) -> bool:
     """Whether a failed attempt is the last: not worth repeating, or the skill's retries are used up.
 
-    An attempt that was lost with its gateway (`unreachable`) or refused by a full or draining one (`refused`)
-    says nothing about the subtask: those do not use up the skill's own retries but a bound of their own.
+    An attempt that was lost with its gateway (`unreachable`, `orphaned`) or its container (`stopped`), or refused by
+    a full or draining one (`refused`), says nothing about the subtask: those do not use up the skill's own retries but
+    a bound of their own.
     """
     if not failure.retryable:
         return True
@@ -396,7 +397,7 @@ def gives_up(target: SubtaskRecord, failure: Failure, *, retries: int) -> bool:
     return len(own) >= retries
 
 
-_NOT_ITS_FAULT = ("unreachable", "refused", "pool")
+_NOT_ITS_FAULT = ("unreachable", "refused", "pool", "stopped", "orphaned")
 KEPT_CHOICES = 3
 """Attempts of a subtask whose record says all that was considered for them; of earlier ones what was decided."""
 MAX_DISPLACEMENTS = 8

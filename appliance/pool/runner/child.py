@@ -39,7 +39,7 @@ MAX_ORDER = 64 * 1024
 
 # Bytes of the memory shared with the zygote.
 IN_TRANSIT, DONE, REASON, TAKEN = 0, 1, 2, 3
-REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned"}
+REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned", 4: "stopped"}
 SLOW = "raise timeout_s in its skill.toml, or find out what it waits for"
 LARGE = "put large things with ctx.put_artifact and return the reference"
 BROKEN = "its last lines are in the log: mend its handler"

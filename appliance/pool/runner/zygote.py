@@ -103,7 +103,8 @@ class Zygote:
         del number, frame
         self._stopping = True
         if self._run is not None:
-            self._run.end(1, GRACE_S)
+            # Nobody called the run off: whoever ordered it may repeat it elsewhere.
+            self._run.end(4, GRACE_S)
 
     def _patience(self) -> float:
         """Seconds until something is due."""

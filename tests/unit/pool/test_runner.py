@@ -255,16 +255,29 @@ async def test_output_is_bounded(zygote: Zygote) -> None:
 
 
 async def test_stop_ends_the_run_and_the_runner(zygote: Zygote, tmp_path: Path) -> None:
-    """Told to stop, the runner ends its run first and then itself."""
+    """Told to stop, the runner ends its run first and then itself; the run was not called off and may be repeated."""
     connection, control = await zygote(), await zygote()
     order = {"op": "run", "run": "r1", "skill": "probe", "params": {"do": "sleep", "pid": str(tmp_path / "pid")}}
     await connection.send(order)
     pid = int(await _wait_for(tmp_path / "pid"))
     await control.send({"op": "stop"})
-    assert (await _finish(connection))[-1]["code"] == "cancelled"
+    last = (await _finish(connection))[-1]
+    assert (last["code"], last["retryable"]) == ("stopped", True)
     assert _gone(pid)
     process = zygote.process  # type: ignore[attr-defined]
     assert await asyncio.wait_for(process.wait(), 10) == 0
+
+
+async def test_a_stopped_container_ends_its_run_for_another_try(zygote: Zygote, tmp_path: Path) -> None:
+    """SIGTERM of the runner, as Podman stops a container, is nobody's cancel."""
+    connection = await zygote()
+    await connection.send(
+        {"op": "run", "run": "r1", "skill": "probe", "params": {"do": "sleep", "pid": str(tmp_path / "pid")}}
+    )
+    await _wait_for(tmp_path / "pid")
+    zygote.process.terminate()  # type: ignore[attr-defined]
+    last = (await _finish(connection))[-1]
+    assert (last["code"], last["retryable"]) == ("stopped", True)
 
 
 async def _waiting(zygote: Zygote) -> int:
