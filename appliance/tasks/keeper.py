@@ -35,8 +35,10 @@ class Keeper:
         self._on_change = on_change
         self._pending: list[Transition] = []
         self._dirty = False
-        self._ready_ns: dict[str, int] = {}
+        self.ready_ns: dict[str, int] = {}
         """When each subtask became ready, on this machine's clock."""
+        self.on_written: Callable[[], None] = lambda: None
+        """The record is written: what follows from it may begin."""
 
     @property
     def settled(self) -> bool:
@@ -44,10 +46,8 @@ class Keeper:
         here = any(each.gateway == self._plane.gateway for each in machine.active(self.record))
         return not here and not self._pending and not self._dirty
 
-    def _written(self) -> None:
-        """The record is written: what follows from it may begin."""
-
-    def _transition(self, kind: TransitionKind, **fields: Any) -> Transition:
+    def transition(self, kind: TransitionKind, **fields: Any) -> Transition:
+        """Return the next transition of the record."""
         return Transition(
             task=self.record.id,
             sequence=self.record.sequence + 1,
@@ -57,17 +57,17 @@ class Keeper:
             **fields,
         )
 
-    def _apply(self, transition: Transition, *, durable: bool = True) -> None:
-        """Apply a transition in memory; `_flush` writes and publishes it before anything follows from it."""
+    def apply(self, transition: Transition, *, durable: bool = True) -> None:
+        """Apply a transition in memory; `flush` writes and publishes it before anything follows from it."""
         before = {each.subtask.id for each in machine.ready(self.record)}
         self.record = machine.apply(self.record, transition)
         self._pending.append(transition)
         self._dirty = self._dirty or durable
         for each in machine.ready(self.record):
             if each.subtask.id not in before:
-                self._ready_ns[each.subtask.id] = time.monotonic_ns()
+                self.ready_ns[each.subtask.id] = time.monotonic_ns()
 
-    async def _flush(self) -> None:
+    async def flush(self) -> None:
         """Write the record, then publish what led to it and send the orders that follow.
 
         Raises SupersededError when the record has moved on.
@@ -90,16 +90,17 @@ class Keeper:
             self._dirty = False
         if not self._pending:
             return
-        self._written()
+        self.on_written()
         for transition in self._pending:
             self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
         self._pending.clear()
         self._plane.session.put(self._plane.keys.task(self.record.id), encode(self.record))
         self._on_change(self.record)
 
-    def _take(self, transition: Transition, *, durable: bool = True) -> bool:
+    def take(self, transition: Transition, *, durable: bool = True) -> bool:
+        """Apply a transition if it fits; returns whether it did."""
         if fits := machine.fits(self.record, transition):
-            self._apply(transition, durable=durable)
+            self.apply(transition, durable=durable)
         return fits
 
     async def _reread(self) -> None:

@@ -244,10 +244,10 @@ async def test_repeated_failures_of_an_attempt_do_not_put_off_the_next(bench: An
     failure = Failure(code="robot", message="slipped", retryable=True)
     bench.tell(request, FAILED, failure=failure)
     await bench.until(lambda record: record.subtasks[0].state is SubtaskState.READY)
-    due = dict(bench.driver._not_before)
+    due = dict(bench.driver._pace.not_before)
     bench.tell(request, FAILED, failure=failure)
     await asyncio.sleep(0.02)
-    assert bench.driver._not_before == due
+    assert bench.driver._pace.not_before == due
 
 
 async def test_a_record_that_has_moved_on_stops_the_driver_before_it_orders_anything(bench: Any) -> None:

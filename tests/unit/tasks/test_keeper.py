@@ -29,5 +29,5 @@ def test_a_run_of_this_gateway_unsettles_until_its_end_is_written() -> None:
         end = Transition(
             task="t", sequence=4, kind=TransitionKind.SUCCEEDED, at_ns=2, coordinator=gateway, subtask="s1", attempt=1
         )
-        assert keeper._take(end)
+        assert keeper.take(end)
         assert not keeper.settled

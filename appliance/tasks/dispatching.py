@@ -1,0 +1,108 @@
+"""Sends the ready subtasks of a driven task to gateways, says what those that stay wait for, and ends its runs.
+
+What it decides becomes transitions; the orders go out when the keeper has written the record with them.
+"""
+
+import time
+
+from appliance.errors import NotFoundError
+from appliance.model import Failure, SubtaskRecord, TaskState
+from appliance.tasks import machine
+from appliance.tasks.bounds import MAX_NOTE, clean
+from appliance.tasks.hearing import Hearing
+from appliance.tasks.keeper import Keeper
+from appliance.tasks.machine import TransitionKind
+from appliance.tasks.orders import Orders, request_for
+from appliance.tasks.pace import Pace
+from appliance.tasks.surroundings import Surroundings
+
+
+class Dispatching:
+    """Dispatches one task's subtasks; on the way to its end, cancels what still runs."""
+
+    def __init__(self, around: Surroundings, keeper: Keeper, orders: Orders, hearing: Hearing, pace: Pace) -> None:
+        self._around = around
+        self._keeper = keeper
+        self._orders = orders
+        self._hearing = hearing
+        self._pace = pace
+        self._cancelled_at: float | None = None
+        self._cancel_at: dict[str, float] = {}
+
+    def advance(self, now: float) -> None:
+        """Dispatch what can be dispatched now, or end what runs if the task is being ended."""
+        keeper = self._keeper
+        if keeper.record.state is TaskState.CANCELLING:
+            self._end_runs(now)
+            return
+        for each in machine.ready(keeper.record):
+            keeper.ready_ns.setdefault(each.subtask.id, time.monotonic_ns())
+            if keeper.record.state is TaskState.RUNNING and self._pace.may_go(each.subtask.id, now):
+                self._dispatch(each, now)
+
+    def _dispatch(self, target: SubtaskRecord, now: float) -> None:
+        keeper, subtask = self._keeper, target.subtask
+        try:
+            manifest = self._around.manifest(subtask.skill)
+        except NotFoundError as error:
+            # Planned on a gateway that knows more skills than this one, or before this one forgot it.
+            failure = Failure(code=error.code, message=error.message, remedy=error.remedy)
+            keeper.apply(
+                keeper.transition(
+                    TransitionKind.ATTEMPT_FAILED,
+                    subtask=subtask.id,
+                    attempt=target.attempt + 1,
+                    failure=failure,
+                    give_up=True,
+                )
+            )
+            return
+        robot = None
+        if subtask.robot is not None:
+            robot, reason = self._around.bind(keeper.record, target)
+            if robot is None:
+                self._wait(target, reason, now)
+                return
+        placement = self._around.place(keeper.record, target, robot)
+        if not placement.order:
+            self._wait(target, f"waits for a gateway: {placement.why}", now)
+            return
+        self._pace.goes(subtask.id)
+        request = request_for(keeper.record, target, manifest, robot=robot, coordinator=self._around.plane.gateway)
+        gateway = placement.order[0]
+        keeper.apply(
+            keeper.transition(
+                TransitionKind.DISPATCHED,
+                subtask=subtask.id,
+                attempt=request.attempt,
+                gateway=gateway,
+                robot=robot,
+                placed=clean(placement.why, MAX_NOTE),
+            )
+        )
+        self._orders.add(gateway, request)
+
+    def _wait(self, target: SubtaskRecord, reason: str, now: float) -> None:
+        """Tell people why it waits, once per reason, and look again soon.
+
+        Written to the record, since every gateway must be able to say why nothing goes on.
+        """
+        if self._pace.waits(target.subtask.id, reason, now):
+            keeper = self._keeper
+            keeper.apply(
+                keeper.transition(
+                    TransitionKind.PROGRESS, subtask=target.subtask.id, attempt=target.attempt, note=clean(reason, 500)
+                )
+            )
+
+    def _end_runs(self, now: float) -> None:
+        if self._cancelled_at is None:
+            self._cancelled_at = now
+        for each in machine.active(self._keeper.record):
+            if now - self._cancelled_at > self._around.config.grace_s:
+                failure = Failure(code="cancelled", message=f"{each.gateway} did not confirm the cancel in time")
+                self._hearing.attempt_failed(each, failure, None)
+            elif self._cancel_at.get(each.subtask.id, 0.0) <= now:
+                # Again and again: the first may overtake the order to run, or be lost.
+                self._cancel_at[each.subtask.id] = now + self._around.config.check_s
+                self._orders.cancel(each, self._keeper.record.id)
