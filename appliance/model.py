@@ -252,6 +252,8 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How often it was passed on to a gateway with a warm container; one is the most."""
     resume: dict[str, Any] | None = None
     """The last checkpoint of an earlier attempt, from which the handler may go on."""
+    calls: int = 0
+    """How many calls had been made when that was saved: those that follow are numbered from there."""
 
     @property
     def run_id(self) -> str:
@@ -299,6 +301,8 @@ class RunEvent(Struct, frozen=True, kw_only=True, omit_defaults=True):
     startup_ms: float | None = None
     """On `started`: request received to first line of the handler, on the executing gateway's clock."""
     duration_ms: float | None = None
+    calls: int = 0
+    """On `checkpoint`: how many calls the handler had made by then."""
 
 
 # --- facts with one owner ----------------------------------------------------------------------------------

@@ -56,6 +56,7 @@ def order(request: RunRequest) -> Frame:
         "inputs": request.inputs,
         "attempt": request.attempt,
         "resume": request.resume,
+        "calls": request.calls,
         "timeout_s": request.deadline_s,
         "memory_mb": request.need.memory_mb,
     }
@@ -167,7 +168,8 @@ class Conversation:
             case "partial":
                 self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
-                self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data"))))
+                calls = int(_number(frame.get("calls")))
+                self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
             case "call":
                 await self._call(frame)
             case "result":

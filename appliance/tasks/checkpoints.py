@@ -39,6 +39,8 @@ class Checkpoint(Struct, frozen=True, kw_only=True):
     gateway: str
     at_ns: int
     data: dict[str, Any]
+    calls: int = 0
+    """Calls of the handler until then: the next one's number, and so the id of its effect, follows from it."""
 
 
 def checkpoint_key(task: str, subtask: str) -> str:
@@ -63,16 +65,15 @@ def _decoded(value: bytes) -> Checkpoint | None:
         return None
 
 
-async def read_checkpoint(dht: Dht, task: str, subtask: str) -> dict[str, Any] | None:
-    """Return the data of a subtask's last checkpoint; None when there is none, or it cannot be had now."""
+async def read_checkpoint(dht: Dht, task: str, subtask: str) -> Checkpoint | None:
+    """Return a subtask's last checkpoint; None when there is none, or it cannot be had now."""
     try:
         record = await dht.read(checkpoint_key(task, subtask))
     except SwiftbotError as error:
         # The attempt begins from the start: that costs time and doubles nothing.
         log.warning("a checkpoint cannot be had", task=task, subtask=subtask, reason=str(error))
         return None
-    found = _decoded(record.value) if record is not None else None
-    return found.data if found is not None else None
+    return _decoded(record.value) if record is not None else None
 
 
 async def remove_checkpoint(dht: Dht, task: str, subtask: str) -> None:
@@ -170,7 +171,8 @@ class Checkpoints:
 
     async def _write(self, event: RunEvent, run: _Run) -> None:
         kept = Checkpoint(
-            attempt=event.attempt, gateway=self._gateway, at_ns=time.time_ns(), data=event.result or {}
+            attempt=event.attempt, gateway=self._gateway, at_ns=time.time_ns(), data=event.result or {},
+            calls=event.calls,
         )  # fmt: skip
         key, value = checkpoint_key(event.task, event.subtask), encode(kept)
         while True:

@@ -49,7 +49,7 @@ from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_deep
-from appliance.tasks.checkpoints import read_checkpoint, remove_checkpoint
+from appliance.tasks.checkpoints import Checkpoint, read_checkpoint, remove_checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
 from appliance.tasks.listing import newest_tasks
@@ -395,7 +395,7 @@ class TaskManager:
         """Note how long a run that succeeded took."""
         self._ahead.durations.add(skill, duration_ms / 1e3)
 
-    async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
+    async def checkpoint(self, task: str, subtask: str) -> Checkpoint | None:
         """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""
         return await read_checkpoint(self.plane.dht, task, subtask)
 

@@ -128,7 +128,9 @@ class Orders:
     async def _send(self, gateway: str, request: RunRequest) -> None:
         try:
             if request.attempt > 1:
-                request = replace(request, resume=await self._around.checkpoint(request.task, request.subtask))
+                saved = await self._around.checkpoint(request.task, request.subtask)
+                if saved is not None:
+                    request = replace(request, resume=saved.data, calls=saved.calls)
             accepted = await self._around.order(gateway, request)
             self._accepted[request.subtask, request.attempt] = accepted
             if accepted.gateway != gateway:

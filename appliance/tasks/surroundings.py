@@ -9,6 +9,7 @@ from appliance.model import Need, Plan, RunAccepted, RunEvent, RunRequest, Subta
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.bounds import MAX_RUN_S
+from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.placement import Placement
 from appliance.tasks.settings import TasksConfig
 
@@ -47,7 +48,7 @@ class Surroundings(Protocol):
         """Note how long a run that succeeded took."""
         ...
 
-    async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
+    async def checkpoint(self, task: str, subtask: str) -> Checkpoint | None:
         """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""
         ...
 

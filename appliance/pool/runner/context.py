@@ -82,6 +82,8 @@ class Context(Surroundings):
         self.inputs: dict[str, dict[str, Any]] = order.get("inputs") or {}
         self.attempt: int = int(order.get("attempt", 1))
         self.resume: dict[str, Any] | None = order.get("resume")
+        if self.resume is not None:
+            link.go_on_from(int(order.get("calls") or 0))
         self.preloaded = preloaded
         self.scratch = scratch
 
@@ -120,13 +122,17 @@ class Context(Surroundings):
         self._tell("partial", "result", result, MAX_NEWS)
 
     def checkpoint(self, data: dict[str, Any]) -> None:
-        """Keep data from which a later attempt could go on (`ctx.resume`); CallError beyond 256 KiB of JSON."""
-        self._tell("checkpoint", "data", data, MAX_CHECKPOINT)
+        """Keep data from which a later attempt could go on (`ctx.resume`); CallError beyond 256 KiB of JSON.
 
-    def _tell(self, kind: str, key: str, value: dict[str, Any], most: int) -> None:
+        The number of calls made so far is kept with it: an attempt that goes on from here makes only those that come
+        after, and they must keep their numbers, by which an effect that was done already is known.
+        """
+        self._tell("checkpoint", "data", data, MAX_CHECKPOINT, calls=self._link.calls)
+
+    def _tell(self, kind: str, key: str, value: dict[str, Any], most: int, **more: int) -> None:
         if not isinstance(value, dict):  # pyright: ignore[reportUnnecessaryIsInstance] - handlers are not checked
             raise CallError("payload", f"a {kind} is a dict, not {type(value).__name__}")
-        data = encode({"ev": kind, key: value})
+        data = encode({"ev": kind, key: value, **more})
         if len(data) > most:
             raise CallError(
                 "payload",

@@ -57,6 +57,15 @@ class Link:
         self._cancelled = False
         self._count = 0
 
+    @property
+    def calls(self) -> int:
+        """Calls made so far, in this attempt and, by its checkpoint, in those before."""
+        return self._count
+
+    def go_on_from(self, calls: int) -> None:
+        """Number the calls after so many that were made before the checkpoint that this attempt goes on from."""
+        self._count = calls
+
     def attach(self, connection: socket.socket) -> None:
         """Take the connection; until then nothing may be sent."""
         self._socket = connection

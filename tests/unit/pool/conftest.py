@@ -96,6 +96,11 @@ def run(ctx):
         ctx.checkpoint([1])
     if do == "resume":
         return ctx.resume
+    if do == "calls in steps":
+        begun = (ctx.resume or {"done": 0})["done"]
+        for step in range(begun, 3):
+            ctx.notify("a", f"step {step}")
+            ctx.checkpoint({"done": step + 1})
     if do == "large":
         return {"x": "y" * (5 * 2**20)}
     if do == "huge call":

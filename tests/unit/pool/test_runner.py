@@ -338,6 +338,29 @@ async def test_news_that_are_too_long(zygote: Zygote) -> None:
     assert (await _run(zygote, "resume", resume={"step": 3}))[-1]["result"] == {"step": 3}
 
 
+async def test_calls_after_a_checkpoint_keep_their_numbers(zygote: Zygote) -> None:
+    """An attempt that goes on from a checkpoint numbers its calls on from there: an effect's id is the same again."""
+
+    async def calls(resume: dict[str, Any] | None, made: int) -> tuple[list[tuple[int, str]], list[int]]:
+        connection = await zygote()
+        order = {"op": "run", "run": "r1", "skill": "probe", "params": {"do": "calls in steps"}, "timeout_s": 10.0}
+        await connection.send(order | {"resume": resume, "calls": made})
+        numbers: list[tuple[int, str]] = []
+        kept: list[int] = []
+        while (frame := await connection.receive()) is not None and frame["ev"] != "result":
+            if frame["ev"] == "call":
+                numbers.append((frame["n"], frame["args"]["text"]))
+                await connection.send({"n": frame["n"], "ok": {}})
+            elif frame["ev"] == "checkpoint":
+                kept.append(frame["calls"])
+        return numbers, kept
+
+    whole, kept = await calls(None, 0)
+    assert whole == [(1, "step 0"), (2, "step 1"), (3, "step 2")]
+    assert kept == [1, 2, 3]
+    assert await calls({"done": 2}, kept[1]) == (whole[2:], [3])
+
+
 def test_frames_round_trip() -> None:
     """Bytes anywhere in a value come back as bytes, whatever pieces the frame arrives in."""
     value = {"a": [b"\x00", {"b": b""}], "c": "ü", "d": None}

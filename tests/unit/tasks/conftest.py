@@ -35,6 +35,7 @@ from appliance.plane.session import Message
 from appliance.pool.selection import Decision
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine
+from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement
@@ -337,7 +338,7 @@ class FakeSurroundings:
         self.passed_to = ""
         self.moved: list[tuple[tuple[str, ...], dict[str, float]]] = []
         self.durations: list[tuple[str, float]] = []
-        self.checkpoints: dict[str, dict[str, Any]] = {}
+        self.checkpoints: dict[str, Checkpoint] = {}
         self.forgotten: list[str] = []
         self.choice: Choice | None = None
         self.slow_answer: asyncio.Event | None = None
@@ -373,7 +374,7 @@ class FakeSurroundings:
         """Remember."""
         self.durations.append((skill, duration_ms))
 
-    async def checkpoint(self, task: str, subtask: str) -> dict[str, Any] | None:
+    async def checkpoint(self, task: str, subtask: str) -> Checkpoint | None:
         """Return the prepared checkpoint."""
         return self.checkpoints.get(subtask)
 

@@ -61,6 +61,12 @@ def event(kind: RunEventKind, *, attempt: int = 1, **fields: Any) -> RunEvent:
     return RunEvent(task="t-1", subtask="s1", attempt=attempt, kind=kind, **fields)
 
 
+async def kept(dht: Any) -> dict[str, Any] | None:
+    """Return the data of the subtask's checkpoint."""
+    found = await read_checkpoint(dht, "t-1", "s1")
+    return None if found is None else found.data
+
+
 @pytest.fixture
 def told(plane: Any) -> Told:
     """Return the checkpoints of a gateway on fakes."""
@@ -71,11 +77,11 @@ async def test_the_last_checkpoint_of_a_failed_run_is_what_the_next_attempt_gets
     """The first is written at once, those that follow within a second are one write at the end: the newest."""
     told.add({"at": 1})
     await told.kept()
-    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 1}
+    assert await kept(told.dht) == {"at": 1}
     for number in range(2, 50):
         told.add({"at": number})
     await told.end(RunEventKind.FAILED)
-    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 49}
+    assert await kept(told.dht) == {"at": 49}
     assert told.dht.writes == 2
     assert [each.kind for each in told.events] == [RunEventKind.CHECKPOINT] * 2
     assert all(each.result is None and "kept" in each.note for each in told.events)
@@ -88,7 +94,7 @@ async def test_writes_of_a_run_are_a_second_apart(told: Told, monkeypatch: pytes
     await told.kept()
     told.add({"at": 2})
     async with asyncio.timeout(5):
-        while await read_checkpoint(told.dht, "t-1", "s1") != {"at": 2}:
+        while await kept(told.dht) != {"at": 2}:
             await asyncio.sleep(0.005)
     await told.end(RunEventKind.SUCCEEDED)
 
@@ -99,10 +105,10 @@ async def test_an_outdated_run_does_not_replace_a_newer_ones(told: Told) -> None
     await told.end(RunEventKind.FAILED, attempt=2)
     told.add({"of": 1}, attempt=1)
     await told.end(RunEventKind.FAILED, attempt=1)
-    assert await read_checkpoint(told.dht, "t-1", "s1") == {"of": 2}
+    assert await kept(told.dht) == {"of": 2}
     told.add({"of": 3}, attempt=3)
     await told.end(RunEventKind.FAILED, attempt=3)
-    assert await read_checkpoint(told.dht, "t-1", "s1") == {"of": 3}
+    assert await kept(told.dht) == {"of": 3}
 
 
 @pytest.mark.parametrize("data", [{"x": "y" * 2000}, {"x": "\ud800"}, "deep"])
@@ -119,7 +125,7 @@ async def test_what_cannot_be_kept_is_refused_and_the_last_one_stands(told: Told
     assert told.events[-1].kind is RunEventKind.LOG
     assert "the last one before it stands" in told.events[-1].note
     await told.end(RunEventKind.FAILED)
-    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 1}
+    assert await kept(told.dht) == {"at": 1}
 
 
 async def test_a_plane_that_fails_costs_the_checkpoint_only(told: Told) -> None:
@@ -127,16 +133,16 @@ async def test_a_plane_that_fails_costs_the_checkpoint_only(told: Told) -> None:
     told.dht.break_next = [UnreachableError("no owner")]
     told.add({"at": 1})
     await told.end(RunEventKind.FAILED)
-    assert await read_checkpoint(told.dht, "t-1", "s1") is None
+    assert await kept(told.dht) is None
     told.add({"at": 2}, attempt=2)
     await told.end(RunEventKind.FAILED, attempt=2)
-    assert await read_checkpoint(told.dht, "t-1", "s1") == {"at": 2}
+    assert await kept(told.dht) == {"at": 2}
 
     async def away(key: str) -> None:
         raise UnreachableError("nobody answers")
 
     told.dht.read = away
-    assert await read_checkpoint(told.dht, "t-1", "s1") is None
+    assert await kept(told.dht) is None
     await remove_checkpoint(told.dht, "t-1", "s1")
 
 

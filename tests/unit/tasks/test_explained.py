@@ -22,6 +22,7 @@ from appliance.model import (
     encode,
 )
 from appliance.tasks import machine, partials
+from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.machine import KEPT_CHOICES, Transition, TransitionKind
 from appliance.tasks.partials import MAX_PARTIAL_BYTES, Partials, shown
 
@@ -80,7 +81,7 @@ async def test_an_answer_that_never_comes_holds_nothing_up(bench: Any) -> None:
 
 async def test_the_next_attempt_goes_on_from_the_last_checkpoint(bench: Any) -> None:
     """A first attempt has none; one that comes after a failure gets what was kept; the end removes it."""
-    bench.around.checkpoints = {"s1": {"at": 3}}
+    bench.around.checkpoints = {"s1": Checkpoint(attempt=1, gateway="gw-1", at_ns=1, data={"at": 3}, calls=2)}
     await bench.start()
     _, request = await bench.ordered()
     assert request.resume is None
@@ -92,7 +93,7 @@ async def test_the_next_attempt_goes_on_from_the_last_checkpoint(bench: Any) -> 
             await asyncio.sleep(0.005)
     bench.tell(request, RunEventKind.FAILED, failure=Failure(code="pool", message="died", retryable=True))
     _, again = await bench.ordered()
-    assert again.resume == {"at": 3}
+    assert (again.resume, again.calls) == ({"at": 3}, 2)
     bench.tell(again, RunEventKind.SUCCEEDED, gateway="gw-2")
     await bench.end()
     assert bench.around.forgotten == ["t-1"]
