@@ -14,7 +14,6 @@ from collections import Counter
 from pathlib import Path
 
 import msgspec
-import psutil
 import structlog
 
 from appliance import logs, service
@@ -51,6 +50,7 @@ from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.remote import Links, RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
+from appliance.vitals import Vitals
 
 log = structlog.get_logger(__name__)
 
@@ -69,7 +69,7 @@ class Gateway:
         self._data = Path(config.data_dir).expanduser()
         self._started_ns = time.time_ns()
         self._stack = contextlib.AsyncExitStack()
-        self._process = psutil.Process()
+        self._vitals = Vitals()
         self._changed = asyncio.Event()
         self._draining = False
         self._ready = asyncio.Event()
@@ -311,7 +311,7 @@ class Gateway:
         """This gateway's account of itself."""
         containers = self.pool.containers()
         capacity = self.config.pool.capacity
-        cpu = psutil.cpu_percent(interval=None)
+        vitals = self._vitals.read()
         moving = [each.refused for each in (self._volumes, self._transfers) if each is not None]
         counters = Counter[str]()
         for each in (self.plane.session.refused, self.hub.refused, self.pool.refused, *moving):
@@ -320,9 +320,9 @@ class Gateway:
             id=self.config.id,
             fleet=self.config.fleet,
             version=VERSION,
-            load=min(1.0, max(cpu / 100, self.executor.running / max(1, capacity))),
-            cpu_percent=cpu,
-            memory_mb=round(self._process.memory_info().rss / 2**20, 1),
+            load=min(1.0, max(vitals.cpu_percent / 100, self.executor.running / max(1, capacity))),
+            cpu_percent=vitals.cpu_percent,
+            memory_mb=vitals.memory_mb,
             capacity=capacity,
             containers=len(containers),
             ready=sum(each.state is ContainerState.READY for each in containers),

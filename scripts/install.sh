@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Installs gateway and recorder as systemd services, or brings an installation up to date (`make install`).
+# Installs gateway, recorder and router as systemd services, or brings an installation up to date (`make install`). The
+# router is not enabled: few fleets need one.
 #
 #   /opt/swiftbot/venv                     the program, from locks/gateway.txt
 #   /usr/local/lib/systemd, sysusers.d, tmpfiles.d
@@ -15,6 +16,8 @@ DESTDIR=${DESTDIR:-}
 OPT=$DESTDIR/opt/swiftbot
 LIB=$DESTDIR/usr/local/lib
 UNITS=(swiftbot-gateway.service swiftbot-recorder.service)
+# There when it is wanted: `systemctl enable --now swiftbot-router`.
+OPTIONAL=(swiftbot-router.service)
 
 say() { echo "[install] $*"; }
 die() {
@@ -50,7 +53,7 @@ if [ -z "${WITHOUT_ENVIRONMENT:-}" ]; then
 fi
 
 say "units"
-for unit in "${UNITS[@]}"; do
+for unit in "${UNITS[@]}" "${OPTIONAL[@]}"; do
   install -D -m 0644 "$PROJECT/systemd/$unit" "$LIB/systemd/system/$unit"
 done
 install -D -m 0755 "$PROJECT/systemd/system-generators/swiftbot-generator" "$LIB/systemd/system-generators/swiftbot-generator"
@@ -102,4 +105,5 @@ systemctl enable --quiet "${UNITS[@]}"
 say "starting (running services drain first)"
 systemctl restart "${UNITS[@]}" ||
   die "the services did not start" "journalctl -u swiftbot-gateway -u swiftbot-recorder -n 50"
+systemctl try-restart "${OPTIONAL[@]}" || say "the router did not come back: journalctl -u swiftbot-router -n 50"
 say "running: systemctl status ${UNITS[*]}"

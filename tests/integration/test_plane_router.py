@@ -2,6 +2,9 @@
 
 import asyncio
 import contextlib
+import os
+import socket
+import sys
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -127,3 +130,29 @@ async def test_a_router_must_listen() -> None:
     """A router without an endpoint to listen on says so."""
     with pytest.raises(ConfigError, match="nothing to listen on"):
         await run_router(PlaneConfig(), stop=asyncio.Event(), ready=lambda _: None, alive=lambda: None)
+
+
+@pytest.mark.fleet
+async def test_the_service_tells_systemd(tmp_path: Path, free_port: int, project_root: Path) -> None:
+    """`swiftbot router`, as its unit runs it, says that it is ready once it listens, goes on, and ends with 0."""
+    at = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
+        told.bind(str(at))
+        told.setblocking(False)
+        loop = asyncio.get_running_loop()
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "appliance.cli", "router", "--listen", f"tcp/127.0.0.1:{free_port}",
+            env={**os.environ, "NOTIFY_SOCKET": str(at)}, cwd=project_root, stdout=asyncio.subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            assert await loop.sock_recv(told, 100) == b"READY=1"
+            _, writer = await asyncio.open_connection("127.0.0.1", free_port)
+            writer.close()
+            assert await loop.sock_recv(told, 100) == b"WATCHDOG=1"
+            assert await loop.sock_recv(told, 100) == b"WATCHDOG=1"
+            process.terminate()
+            assert await process.wait() == 0
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
