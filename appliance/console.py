@@ -15,6 +15,7 @@ from rich.text import Text
 
 from appliance.doctor import Check
 from appliance.model import (
+    PLAIN_PRIORITY,
     Choice,
     ContainerInfo,
     GatewayStatus,
@@ -157,7 +158,7 @@ def task_table(record: TaskRecord) -> Group:
         record.id,
         " ",
         (str(record.state), _TASK_STYLES.get(record.state, "yellow")),
-        f"  coordinated by {record.coordinator}\n{record.instruction}",
+        f"  coordinated by {record.coordinator}{_order_text(record)}\n{record.instruction}",
     )
     ways = [Text(f"  {each.subtask.id} {way}", style="dim") for each in record.subtasks if (way := _way_text(each))]
     told = [
@@ -170,6 +171,18 @@ def task_table(record: TaskRecord) -> Group:
         remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""
         parts.append(Text(f"{record.failure.message}{remedy}", style="red"))
     return Group(*parts)  # pyright: ignore[reportArgumentType]
+
+
+def _order_text(record: TaskRecord) -> str:
+    """What sets a task apart in the order of things, and its group; empty for a plain one without."""
+    told = "" if record.priority == PLAIN_PRIORITY else f", priority {record.priority}"
+    if record.deadline_s:
+        told += f", deadline {record.deadline_s:g} s"
+        if not record.state.final:
+            told += f" ({max(0.0, record.deadline_s - record.elapsed_s):.0f} s left)"
+    if record.group is not None:
+        told += f"\ngroup: {', '.join(record.group.members)}; root {record.group.root}"
+    return told
 
 
 def _way_text(record: SubtaskRecord) -> str:

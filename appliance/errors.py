@@ -28,10 +28,12 @@ class SwiftbotError(Exception):
     code: ClassVar[str] = "internal"
     exit_code: ClassVar[int] = 1
 
-    def __init__(self, message: str, *, remedy: str = "") -> None:
+    def __init__(self, message: str, *, remedy: str = "", retry_after_s: float = 0.0) -> None:
         super().__init__(message)
         self.message = message
         self.remedy = remedy
+        self.retry_after_s = retry_after_s
+        """Of what was refused for want of room: when to ask again; 0: not known."""
 
     def __str__(self) -> str:
         """Cause and remedy in one line."""
@@ -136,6 +138,8 @@ def _tree(root: type[SwiftbotError]) -> dict[str, type[SwiftbotError]]:
     return found
 
 
-def from_code(code: str, message: str, remedy: str = "") -> SwiftbotError:
+def from_code(code: str, message: str, remedy: str = "", retry_after_s: float = 0.0) -> SwiftbotError:
     """Rebuild an error that came over the wire; an unknown code becomes the base class."""
-    return _tree(SwiftbotError).get(code, SwiftbotError)(message, remedy=remedy)
+    error = _tree(SwiftbotError).get(code, SwiftbotError)(message, remedy=remedy)
+    error.retry_after_s = retry_after_s
+    return error

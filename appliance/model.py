@@ -7,10 +7,10 @@ nanoseconds for people and logs, never compared between gateways to decide anyth
 """
 
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
-from msgspec import Struct, field
+from msgspec import Meta, Struct, field
 
 VersionVector = dict[str, int]
 """Gateway id -> number of writes by that gateway seen in this version (Dynamo's version vectors)."""
@@ -190,12 +190,44 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
         return self.attempts[-1].number if self.attempts else 0
 
 
+PLAIN_PRIORITY = 5
+"""Priority of what nobody gave one: as much room above it as below."""
+HIGHEST_PRIORITY = 9
+LONGEST_DEADLINE_S = 30 * 86_400.0
+"""Beyond a month a deadline is no deadline; a bound keeps sums of seconds exact."""
+
+
+class Group(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The dynamic group of a task: the gateways that may serve it (paper, Dynamic Groups).
+
+    `root` is the member that owns the task's key on the ring, or the next one after it: it coordinates the task.
+    """
+
+    members: tuple[str, ...]
+    """Best first by the score when it was formed."""
+    root: str
+    number: int = 1
+    """Counts the group's formations, so that a change is told from a repetition."""
+    why: str = ""
+    """How it came to be, with the scores, in words."""
+
+
 class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A task as it stands in the DHT under `task/{id}`; its version vector is kept beside it by the store."""
 
     id: str
     instruction: str
     submitter: str = ""
+    priority: int = PLAIN_PRIORITY
+    """0 (whenever there is room) to 9 (before all others)."""
+    deadline_s: float = 0.0
+    """Seconds from acceptance after which it ends as failed, with code `deadline`; 0: none."""
+    elapsed_s: float = 0.0
+    """Seconds since acceptance at the last transition, each coordinator's by its own monotonic clock, added up."""
+    within: tuple[str, ...] = ()
+    """The gateways that may serve it, as its submitter wished; empty: any."""
+    group: Group | None = None
+    """None before the first subtask was placed."""
     state: TaskState = TaskState.ACCEPTED
     plan: Plan | None = None
     subtasks: tuple[SubtaskRecord, ...] = ()
@@ -221,6 +253,12 @@ class TaskRequest(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_
     id: str = ""
     submitter: str = ""
     plan: Plan | None = None
+    priority: Annotated[int, Meta(ge=0, le=HIGHEST_PRIORITY)] = PLAIN_PRIORITY
+    """0 (whenever there is room) to 9 (before all others)."""
+    deadline_s: Annotated[float, Meta(ge=0, le=LONGEST_DEADLINE_S)] = 0.0
+    """Seconds from acceptance after which it is of no use any more and ends as failed; 0: none."""
+    group: Annotated[tuple[str, ...], Meta(max_length=64)] = ()
+    """Gateways that alone may serve it, by id; empty: whichever can."""
 
 
 # --- runs: one attempt of a subtask on one gateway ---------------------------------------------------------
@@ -254,6 +292,14 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The last checkpoint of an earlier attempt, from which the handler may go on."""
     calls: int = 0
     """How many calls had been made when that was saved: those that follow are numbered from there."""
+    priority: int = PLAIN_PRIORITY
+    """Of its task: orders those who wait for a container."""
+    due_s: float = 0.0
+    """Seconds until its task's deadline when the order was sent; 0: none."""
+    submitter: str = ""
+    """Whose task it is: those who wait for a container are served in fair turns."""
+    group: tuple[str, ...] = ()
+    """Members of the task's group, to which it may be passed on; empty: any gateway."""
 
     @property
     def run_id(self) -> str:
@@ -536,6 +582,8 @@ class ErrorReply(Struct, frozen=True, kw_only=True, omit_defaults=True):
     message: str
     remedy: str = ""
     problems: tuple[str, ...] = ()
+    retry_after_s: float = 0.0
+    """When what was refused for want of room is worth asking again, by the measured rate; 0: not known."""
 
 
 def encode(value: Any) -> bytes:

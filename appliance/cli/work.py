@@ -6,12 +6,13 @@ import uuid
 from typing import Annotated
 
 from cyclopts import App, Parameter
+from cyclopts.validators import Number
 
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, SwiftbotError
-from appliance.model import TaskRecord, TaskRequest, TaskState
+from appliance.model import PLAIN_PRIORITY, TaskRecord, TaskRequest, TaskState
 from appliance.tasks.view import view
 
 task_app = App(name="task", help="List, show and cancel tasks.", group=WORK)
@@ -43,6 +44,16 @@ def submit(
         bool, Parameter(negative="", help="Show progress and wait for the end; Ctrl-C cancels it.")
     ] = False,
     task_id: Annotated[str, Parameter(name="--id", help="Task id; a known one is not done twice.")] = "",
+    priority: Annotated[
+        int, Parameter(help="0 (whenever there is room) to 9 (before all others).", validator=Number(gte=0, lte=9))
+    ] = PLAIN_PRIORITY,
+    deadline: Annotated[
+        float,
+        Parameter(help="Seconds from now after which it is of no use and ends; 0: none.", validator=Number(gte=0)),
+    ] = 0.0,
+    group: Annotated[
+        tuple[str, ...], Parameter(help="A gateway that may serve it; repeat for several. None: whichever can.")
+    ] = (),
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -50,7 +61,14 @@ def submit(
     from appliance.demo import follow
 
     # The id is chosen here: an interrupt while the task is being handed in must know what to cancel.
-    request = TaskRequest(instruction=text, id=task_id or f"t-{uuid.uuid4().hex[:10]}", submitter=_me())
+    request = TaskRequest(
+        instruction=text,
+        id=task_id or f"t-{uuid.uuid4().hex[:10]}",
+        submitter=_me(),
+        priority=priority,
+        deadline_s=deadline,
+        group=group,
+    )
 
     async def go() -> TaskRecord:
         async with FleetClient(where.endpoint()) as client:

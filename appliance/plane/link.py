@@ -41,7 +41,13 @@ def reply(
         if error is not None or answer is None:
             error = error or SwiftbotError("no answer")
             problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
-            body = ErrorReply(code=error.code, message=error.message, remedy=error.remedy, problems=problems)
+            body = ErrorReply(
+                code=error.code,
+                message=error.message,
+                remedy=error.remedy,
+                problems=problems,
+                retry_after_s=error.retry_after_s,
+            )
             query.reply_err(encode(body), encoding="application/json")
         elif bulk:
             query.reply(key, answer, encoding="application/octet-stream")
@@ -66,7 +72,7 @@ def error_of(error: zenoh.ReplyError | None) -> SwiftbotError:
         body = msgspec.json.decode(text, type=ErrorReply)
     except (msgspec.DecodeError, UnicodeDecodeError):
         return SwiftbotError(f"answered with an error that cannot be read: {text[:200]!r}")
-    rebuilt = from_code(body.code, body.message, body.remedy)
+    rebuilt = from_code(body.code, body.message, body.remedy, body.retry_after_s)
     if body.problems and hasattr(rebuilt, "problems"):
         rebuilt.problems = body.problems  # pyright: ignore[reportAttributeAccessIssue]
     return rebuilt

@@ -115,7 +115,9 @@ class Rpc:
 
 def _failure(error: Exception) -> ErrorReply:
     if isinstance(error, SwiftbotError):
-        return ErrorReply(code=error.code, message=error.message, remedy=error.remedy)
+        return ErrorReply(
+            code=error.code, message=error.message, remedy=error.remedy, retry_after_s=error.retry_after_s
+        )
     return ErrorReply(code="internal", message=f"{type(error).__name__}: {error}")
 
 

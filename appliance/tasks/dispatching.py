@@ -68,7 +68,14 @@ class Dispatching:
             self._wait(target, f"waits for a gateway: {placement.why}", now)
             return
         self._pace.goes(subtask.id)
-        request = request_for(keeper.record, target, manifest, robot=robot, coordinator=self._around.plane.gateway)
+        request = request_for(
+            keeper.record,
+            target,
+            manifest,
+            robot=robot,
+            coordinator=self._around.plane.gateway,
+            elapsed_s=keeper.elapsed_s,
+        )
         gateway = placement.order[0]
         keeper.apply(
             keeper.transition(

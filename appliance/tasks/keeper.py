@@ -37,8 +37,15 @@ class Keeper:
         self._dirty = False
         self.ready_ns: dict[str, int] = {}
         """When each subtask became ready, on this machine's clock."""
+        self._since = time.monotonic() - record.elapsed_s
+        """When the task was accepted, by this machine's monotonic clock."""
         self.on_written: Callable[[], None] = lambda: None
         """The record is written: what follows from it may begin."""
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the task was accepted: those that the record carries, and those since it was taken up here."""
+        return time.monotonic() - self._since
 
     @property
     def settled(self) -> bool:
@@ -54,6 +61,7 @@ class Keeper:
             kind=kind,
             at_ns=time.time_ns(),
             coordinator=self._plane.gateway,
+            elapsed_s=round(self.elapsed_s, 3),
             **fields,
         )
 

@@ -23,9 +23,11 @@ from msgspec.structs import replace
 
 from appliance.errors import SwiftbotError
 from appliance.model import (
+    PLAIN_PRIORITY,
     Attempt,
     Choice,
     Failure,
+    Group,
     Phase,
     Plan,
     SubtaskRecord,
@@ -43,6 +45,8 @@ class TransitionKind(StrEnum):
     PLAN_FAILED = "plan failed"
     ADOPTED = "adopted"
     """Another gateway now coordinates it (takeover)."""
+    GROUPED = "grouped"
+    """Its dynamic group was formed, or formed anew (`group`)."""
     DISPATCHED = "dispatched"
     STARTED = "started"
     PROGRESS = "progress"
@@ -66,6 +70,12 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     instruction: str = ""
     submitter: str = ""
     plan: Plan | None = None
+    priority: int = PLAIN_PRIORITY
+    deadline_s: float = 0.0
+    within: tuple[str, ...] = ()
+    group: Group | None = None
+    elapsed_s: float = 0.0
+    """Seconds since the task was accepted (see `TaskRecord.elapsed_s`)."""
     subtask: str = ""
     attempt: int = 0
     robot: str | None = None
@@ -112,6 +122,9 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
             id=event.task,
             instruction=event.instruction,
             submitter=event.submitter,
+            priority=event.priority,
+            deadline_s=event.deadline_s,
+            within=event.within,
             plan=event.plan,
             coordinator=event.coordinator,
             created_ns=event.at_ns,
@@ -128,7 +141,13 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
     if handler is None:
         raise StaleTransitionError(f"{event.kind} of a task that was accepted before")
     changed = _settle(handler(record, event))
-    return replace(changed, sequence=event.sequence, updated_ns=event.at_ns, coordinator=event.coordinator)
+    return replace(
+        changed,
+        sequence=event.sequence,
+        updated_ns=event.at_ns,
+        coordinator=event.coordinator,
+        elapsed_s=max(record.elapsed_s, event.elapsed_s),
+    )
 
 
 def fits(record: TaskRecord, event: Transition) -> bool:
@@ -158,6 +177,12 @@ def _plan_failed(record: TaskRecord, event: Transition) -> TaskRecord:
 
 def _adopted(record: TaskRecord, _: Transition) -> TaskRecord:
     return record
+
+
+def _grouped(record: TaskRecord, event: Transition) -> TaskRecord:
+    if event.group is None or not event.group.members or event.group.root not in event.group.members:
+        raise StaleTransitionError(f"a group of task {record.id} without members, or with a root that is none")
+    return replace(record, group=event.group)
 
 
 def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
@@ -353,6 +378,7 @@ _HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] 
     TransitionKind.PLANNED: _planned,
     TransitionKind.PLAN_FAILED: _plan_failed,
     TransitionKind.ADOPTED: _adopted,
+    TransitionKind.GROUPED: _grouped,
     TransitionKind.DISPATCHED: _dispatched,
     TransitionKind.STARTED: _started,
     TransitionKind.PROGRESS: _progress,

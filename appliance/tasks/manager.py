@@ -30,6 +30,9 @@ from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import PlanContext
 from appliance.llm.validate import validate
 from appliance.model import (
+    HIGHEST_PRIORITY,
+    LONGEST_DEADLINE_S,
+    PLAIN_PRIORITY,
     Failure,
     Plan,
     RunAccepted,
@@ -186,6 +189,17 @@ class TaskManager:
             raise PayloadError(f"the submitter's name has more than {MAX_SUBMITTER} characters")
         if request.plan is not None and any(too_deep(each.params) for each in request.plan.subtasks):
             raise PayloadError(f"parameters are nested more than {MAX_DEPTH} deep", remedy="write them flat")
+        if not 0 <= request.priority <= HIGHEST_PRIORITY:
+            raise PayloadError(
+                f"priority {request.priority} is none", remedy=f"0 to {HIGHEST_PRIORITY}, {PLAIN_PRIORITY} is plain"
+            )
+        if not 0 <= request.deadline_s <= LONGEST_DEADLINE_S:  # false for what is not a number
+            raise PayloadError(
+                f"a deadline of {request.deadline_s:g} s is none",
+                remedy=f"seconds from now, up to {LONGEST_DEADLINE_S:g}; 0 for none",
+            )
+        for name in request.group:
+            check_name(name, "gateway")
         task = request.id or f"t-{uuid.uuid4().hex[:10]}"
         return replace(request, instruction=instruction, id=check_name(task, "task"))
 
@@ -205,6 +219,9 @@ class TaskManager:
             coordinator=self.plane.gateway,
             instruction=request.instruction,
             submitter=request.submitter,
+            priority=request.priority,
+            deadline_s=request.deadline_s,
+            within=request.group,
             plan=request.plan,
         )
         record = machine.apply(None, transition)

@@ -35,9 +35,15 @@ way: a run that takes no time can be heard of before it."""
 
 
 def request_for(
-    record: TaskRecord, target: SubtaskRecord, manifest: SkillManifest, *, robot: str | None, coordinator: str
+    record: TaskRecord,
+    target: SubtaskRecord,
+    manifest: SkillManifest,
+    *,
+    robot: str | None,
+    coordinator: str,
+    elapsed_s: float = 0.0,
 ) -> RunRequest:
-    """Return the order for the next attempt at a subtask."""
+    """Return the order for the next attempt at a subtask; `elapsed_s`: since its task was accepted."""
     subtask = target.subtask
     return RunRequest(
         task=record.id,
@@ -50,6 +56,10 @@ def request_for(
         inputs=_inputs(record, target),
         coordinator=coordinator,
         deadline_s=deadline_s(manifest, subtask.params),
+        priority=record.priority,
+        due_s=max(0.001, record.deadline_s - elapsed_s) if record.deadline_s else 0.0,
+        submitter=record.submitter,
+        group=record.group.members if record.group else (),
     )
 
 

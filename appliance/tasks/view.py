@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from appliance.model import Failure, SubtaskRecord, TaskRecord
+from appliance.model import Failure, Group, SubtaskRecord, TaskRecord
 
 
 class SubtaskView(Struct, frozen=True, kw_only=True):
@@ -47,6 +47,13 @@ class TaskView(Struct, frozen=True, kw_only=True):
     state: str
     submitter: str
     coordinator: str
+    priority: int
+    deadline_s: float | None
+    """Seconds from acceptance; None without one."""
+    elapsed_s: float
+    """Seconds since acceptance, at its last transition."""
+    group: Group | None
+    """The gateways that serve it and its root; None before the first subtask was placed."""
     domain: str | None
     tier: str | None
     confidence: float | None
@@ -66,6 +73,10 @@ def view(record: TaskRecord) -> TaskView:
         state=str(record.state),
         submitter=record.submitter,
         coordinator=record.coordinator,
+        priority=record.priority,
+        deadline_s=record.deadline_s or None,
+        elapsed_s=record.elapsed_s,
+        group=record.group,
         domain=plan.domain if plan else None,
         tier=str(plan.tier) if plan else None,
         confidence=plan.confidence if plan else None,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.model import Failure, Phase, Plan, Subtask, SubtaskState, TaskRecord, TaskState
+from appliance.model import Failure, Group, Phase, Plan, Subtask, SubtaskState, TaskRecord, TaskState
 from appliance.tasks import machine
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind, apply
 
@@ -58,6 +58,23 @@ def test_all_succeeded_ends_the_task() -> None:
     assert record.state is TaskState.SUCCEEDED
     with pytest.raises(StaleTransitionError, match="already succeeded"):
         step(record, TransitionKind.CANCEL)
+
+
+def test_a_group_stands_in_the_record_and_has_its_root_among_its_members() -> None:
+    """The transition `grouped` sets it, a later one replaces it; one whose root is no member does not fit."""
+    record = step(planned(), TransitionKind.GROUPED, group=Group(members=("gw-2", "gw-1"), root="gw-1", why="x"))
+    record = step(record, TransitionKind.GROUPED, group=Group(members=("gw-1",), root="gw-1", number=2))
+    assert record.group == Group(members=("gw-1",), root="gw-1", number=2)
+    for wrong in (None, Group(members=(), root=""), Group(members=("gw-1",), root="gw-2")):
+        with pytest.raises(StaleTransitionError):
+            step(record, TransitionKind.GROUPED, group=wrong)
+
+
+def test_time_since_acceptance_only_grows() -> None:
+    """A coordinator that knows of less elapsed time than the record does not turn it back."""
+    record = step(planned(), TransitionKind.ADOPTED, elapsed_s=7.5)
+    assert record.elapsed_s == 7.5
+    assert step(record, TransitionKind.ADOPTED, elapsed_s=3.0).elapsed_s == 7.5
 
 
 def test_result_of_an_outdated_attempt_is_stale() -> None:

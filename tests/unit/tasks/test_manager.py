@@ -167,6 +167,18 @@ async def test_hostile_requests_are_refused_with_a_reason(manager: TaskManager, 
     assert not plane.dht.records
 
 
+async def test_priority_deadline_and_group_are_kept_and_checked(manager: TaskManager, plane: Any) -> None:
+    """What the submitter asked for stands in the record; numbers and names that can be none are refused."""
+    asked = replace(wish(plane), priority=9, deadline_s=60.0, group=("gw-1", "gw-2"))
+    record = await manager.submit(asked)
+    assert (record.priority, record.deadline_s, record.within) == (9, 60.0, ("gw-1", "gw-2"))
+    for wrong in ({"priority": 10}, {"priority": -1}, {"deadline_s": float("nan")}, {"deadline_s": -1.0},
+                  {"deadline_s": float("inf")}, {"group": ("no name",)}):  # fmt: skip
+        with pytest.raises(PayloadError):
+            await manager.submit(replace(wish(plane, "t-wrong"), **wrong))
+    assert "task/t-wrong" not in plane.dht.records
+
+
 async def test_a_silent_owner_is_asked_again_and_then_its_successor(manager: TaskManager, plane: Any) -> None:
     """Submission survives the death of the key's owner."""
 
