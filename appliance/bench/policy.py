@@ -29,6 +29,15 @@ FOREVER_S = 1e9
 DEFAULT = "default"
 KEEP_ALIVE = "keep-alive"
 CLAIRVOYANT = "clairvoyant"
+FLEET = 10
+"""Gateways of the fleet in which the shipped default, which is federated, is held against keep-alive."""
+FLEET_TRACES: dict[str, Callable[[int], Trace]] = {
+    "azure": lambda seed: azure(seed=seed, most_rate=0.1 * FLEET, duration_s=7200.0, gateways=FLEET),
+    "poisson": lambda seed: plain("poisson", seed=seed, rate=0.5 * FLEET, duration_s=7200.0, gateways=FLEET),
+    "bursts": lambda seed: plain("bursts", seed=seed, rate=0.5 * FLEET, duration_s=7200.0, gateways=FLEET),
+    "diurnal": lambda seed: plain("diurnal", seed=seed, rate=0.2 * FLEET, duration_s=14_400.0, gateways=FLEET),
+    "timer": lambda seed: plain("timer", seed=seed, rate=0.5 * FLEET, duration_s=7200.0, gateways=FLEET),
+}
 TICKS = 17_280
 """The pools are gone through so often over a trace, but at most once a second: for a day every 5 s."""
 TRACES: dict[str, Callable[[int], Trace]] = {
@@ -203,6 +212,39 @@ def over_gateways(
     return result
 
 
+def in_a_fleet(
+    kinds: Sequence[str], budgets_mb: Sequence[int], *, seed: int, progress: Progress = lambda _: None
+) -> dict[str, Any]:
+    """Return the default as it is shipped (federated) beside keep-alive, on each gateway of a fleet with equal memory.
+
+    A gateway's load is that of the traces of one gateway; half of each image's runs come to its home, the others
+    anywhere. `fewer_at_budget` as in `compare`; memory held idle is told per gateway. `keep_alive_federated` is
+    keep-alive that looks on other gateways too: what is left then is the policy's own.
+    """
+    chosen = policies()
+    result: dict[str, Any] = {}
+    for kind in kinds:
+        trace = FLEET_TRACES[kind](seed)
+        lines: dict[str, Any] = {"runs": len(trace.arrivals)}
+        for budget in budgets_mb:
+            progress(f"{FLEET} gateways: {kind} with {budget} MB each")
+            points: dict[str, Point] = {}
+            for name, policy, mode in (
+                ("keep_alive", KEEP_ALIVE, "local"),
+                ("keep_alive_federated", KEEP_ALIVE, "federated"),
+                (DEFAULT, DEFAULT, "federated"),
+            ):
+                outcome = simulate(trace, replace(chosen[policy], memory_mb=budget, mode=mode), tick_s=10.0)
+                points[name] = point(trace, budget, outcome)
+            fewer = _fewer(points[DEFAULT].cold_percent, points["keep_alive"].cold_percent)
+            lines[str(budget)] = {
+                name: {"cold_percent": each.cold_percent, "wasted_gb": round(each.wasted_gb / FLEET, 3)}
+                for name, each in points.items()
+            } | {"fewer_at_budget": fewer}
+        result[kind] = lines
+    return result
+
+
 def _plain(each: Point) -> dict[str, Any]:
     return {name: getattr(each, name) for name in each.__struct_fields__}
 
@@ -222,7 +264,7 @@ def run(
         traces: names of generated traces (TRACES); all when none is named and none recorded.
         recorded: file of a recorded trace, JSONL or a fleet's MCAP log.
         budgets_mb: memory budgets of a gateway.
-        gateways: numbers of gateways for federated against local.
+        gateways: numbers of gateways for federated against local; with none, no fleet is simulated.
         seed: of the traces.
         progress: told what is being played.
 
@@ -242,5 +284,7 @@ def run(
     }
     if gateways:
         result["gateways"] = over_gateways(gateways, seed=seed, budget_mb=2048, progress=progress)
+        if recorded is None:
+            result["fleet"] = in_a_fleet(traces or tuple(FLEET_TRACES), budgets_mb, seed=seed, progress=progress)
     result["seconds"] = round(time.perf_counter() - began, 1)
     return result
