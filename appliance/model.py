@@ -158,6 +158,12 @@ class Attempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Why this gateway: the coarse scores, in words."""
     choice: Choice | None = None
     """Why this container: what the gateway's selection weighed."""
+    left: str = ""
+    """Why it was left for the next one while nothing was wrong with it: it was moved, and where to."""
+    load: float = 0.0
+    """Load of the gateway when it was chosen, 0 to 1: concurrent versions are resolved by it."""
+    free: int = 0
+    """Ready containers it had then, for the same reason."""
 
 
 class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -181,6 +187,8 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     checkpoint_ns: int = 0
     """When its last checkpoint was kept, from which the next attempt would go on; 0 when there is none."""
     attempts: tuple[Attempt, ...] = ()
+    fence: int = 0
+    """Attempts up to this number may have been made by a coordinator whose version lost; the next is above it."""
     result: dict[str, Any] | None = None
     failure: Failure | None = None
 
@@ -188,6 +196,33 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     def attempt(self) -> int:
         """Number of the current attempt, 0 before the first."""
         return self.attempts[-1].number if self.attempts else 0
+
+    @property
+    def next_attempt(self) -> int:
+        """Number of the attempt after this one: higher than any that was ever made, here or elsewhere."""
+        return max(self.attempt, self.fence) + 1
+
+
+class LostRun(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
+    """A subtask as a version of a task had it that lost against another."""
+
+    subtask: str
+    attempt: int
+    gateway: str
+    state: SubtaskState
+
+
+class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
+    """A version of a task that lost: two coordinators had written it without knowing of each other (a partition)."""
+
+    coordinator: str
+    """Whose version it was."""
+    sequence: int
+    state: TaskState
+    runs: tuple[LostRun, ...] = ()
+    """What differs from the version that stands: attempts it had made or finished by itself."""
+    settled: bool = False
+    """Whether its runs have been ended and people told."""
 
 
 PLAIN_PRIORITY = 5
@@ -237,6 +272,8 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     updated_ns: int = 0
     sequence: int = 0
     """Number of transitions applied so far."""
+    splits: tuple[Split, ...] = ()
+    """Versions that lost against this one, at most 8."""
 
     def of(self, subtask_id: str) -> SubtaskRecord:
         """Return the record of one subtask; KeyError when the plan has none of that id."""
@@ -300,6 +337,10 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Whose task it is: those who wait for a container are served in fair turns."""
     group: tuple[str, ...] = ()
     """Members of the task's group, to which it may be passed on; empty: any gateway."""
+    moves: int = 0
+    """How often the subtask was moved from one gateway to another before."""
+    expected_s: float = 0.0
+    """How long runs of the skill take by the coordinator's experience; 0 when it has none."""
 
     @property
     def run_id(self) -> str:

@@ -14,7 +14,7 @@ from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders, request_for
 from appliance.tasks.pace import Pace
-from appliance.tasks.surroundings import Surroundings
+from appliance.tasks.surroundings import MoveReady, Surroundings, figures
 
 
 class Dispatching:
@@ -51,7 +51,7 @@ class Dispatching:
                 keeper.transition(
                     TransitionKind.ATTEMPT_FAILED,
                     subtask=subtask.id,
-                    attempt=target.attempt + 1,
+                    attempt=target.next_attempt,
                     failure=failure,
                     give_up=True,
                 )
@@ -85,9 +85,45 @@ class Dispatching:
                 gateway=gateway,
                 robot=robot,
                 placed=clean(placement.why, MAX_NOTE),
+                **figures(self._around.plane, gateway),
             )
         )
         self._orders.add(gateway, request)
+
+    def move(self, news: MoveReady) -> None:
+        """Leave a run for a new attempt on the gateway that was made ready for it, unless it has ended meanwhile."""
+        keeper = self._keeper
+        try:
+            target = keeper.record.of(news.subtask)
+            manifest = self._around.manifest(target.subtask.skill)
+        except (KeyError, NotFoundError):
+            news.give_up("the task has no such subtask, or its coordinator no such skill")
+            return
+        if news.outcome.done():
+            return
+        request = request_for(
+            keeper.record,
+            target,
+            manifest,
+            robot=target.bound_robot,
+            coordinator=self._around.plane.gateway,
+            elapsed_s=keeper.elapsed_s,
+        )
+        moved = keeper.transition(
+            TransitionKind.MOVED,
+            subtask=news.subtask,
+            attempt=news.attempt,
+            gateway=news.gateway,
+            note=clean(news.why, MAX_NOTE),
+            placed=clean(news.placed, MAX_NOTE),
+            choice=self._orders.choice(news.subtask, news.attempt),
+            **figures(self._around.plane, news.gateway),
+        )
+        if request.attempt != news.next_attempt or not keeper.take(moved):
+            news.give_up(f"attempt {news.attempt} has ended meanwhile")
+            return
+        keeper.ready_ns[news.subtask] = time.monotonic_ns()
+        self._orders.move(news, request, left=target)
 
     def _wait(self, target: SubtaskRecord, reason: str, now: float) -> None:
         """Tell people why it waits, once per reason, and look again soon.

@@ -26,7 +26,7 @@ from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
 from appliance.tasks.planning import plan_it
-from appliance.tasks.surroundings import CancelAsked, GatewayLost, Input, RunNews, Surroundings, Wake
+from appliance.tasks.surroundings import CancelAsked, GatewayLost, Input, MoveReady, RunNews, Surroundings, Wake
 
 log = structlog.get_logger(__name__)
 
@@ -158,6 +158,8 @@ class Driver:
             case CancelAsked():
                 if self.record.state is TaskState.RUNNING:
                     self._keeper.apply(self._keeper.transition(TransitionKind.CANCEL))
+            case MoveReady():
+                self._dispatching.move(news)
             case Wake():
                 self._pace.look_again()
 

@@ -30,6 +30,7 @@ from appliance.model import (
     Group,
     Phase,
     Plan,
+    Split,
     SubtaskRecord,
     SubtaskState,
     TaskRecord,
@@ -56,6 +57,10 @@ class TransitionKind(StrEnum):
     """A checkpoint of a run was kept, from which the next attempt would go on."""
     SUCCEEDED = "succeeded"
     ATTEMPT_FAILED = "attempt failed"
+    MOVED = "moved"
+    """A run in progress was left for a new attempt on another gateway (`gateway`; `note`: why)."""
+    HEALED = "healed"
+    """Versions that lost against this one were found (`splits`); their attempts are fenced off (`fences`)."""
     CANCEL = "cancel"
 
 
@@ -94,6 +99,14 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How the container of the attempt was chosen, on the first transition after that was heard."""
     give_up: bool = False
     """Of a failed attempt: no further one will be made."""
+    load: float = 0.0
+    """On `dispatched` and `moved`: load of that gateway as the coordinator knew it."""
+    free: int = 0
+    """On `dispatched` and `moved`: ready containers it had."""
+    splits: tuple[Split, ...] = ()
+    """On `healed`: all that the record has of them from now on."""
+    fences: dict[str, int] = {}
+    """On `healed`: by subtask, the highest attempt that may have been made elsewhere."""
 
 
 class StaleTransitionError(SwiftbotError):
@@ -135,7 +148,7 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
         raise StaleTransitionError(f"transition of task {event.task} applied to {record.id}")
     if event.sequence != record.sequence + 1:
         raise StaleTransitionError(f"sequence {event.sequence} after {record.sequence}")
-    if record.state.final:
+    if record.state.final and event.kind is not TransitionKind.HEALED:
         raise StaleTransitionError(f"task {record.id} has already {record.state}")
     handler = _HANDLERS.get(event.kind)
     if handler is None:
@@ -189,8 +202,8 @@ def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
     if record.state is not TaskState.RUNNING or target.state is not SubtaskState.READY:
         raise StaleTransitionError(f"dispatch of {event.subtask}, which is {target.state}")
-    if event.attempt != target.attempt + 1:
-        raise StaleTransitionError(f"attempt {event.attempt} of {event.subtask} after {target.attempt}")
+    if event.attempt != target.next_attempt:
+        raise StaleTransitionError(f"attempt {event.attempt} of {event.subtask}, which is at {target.attempt}")
     return _with(
         record,
         replace(
@@ -207,10 +220,44 @@ def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
             failure=None,
             attempts=(
                 *_faded(target.attempts),
-                Attempt(number=event.attempt, gateway=event.gateway, placed=event.placed),
+                _attempt(event.attempt, event),
             ),
         ),
     )
+
+
+def _attempt(number: int, event: Transition) -> Attempt:
+    return Attempt(number=number, gateway=event.gateway, placed=event.placed, load=event.load, free=event.free)
+
+
+def _moved(record: TaskRecord, event: Transition) -> TaskRecord:
+    """Leave a run for a new attempt elsewhere; what it told so far stays until the new one tells more."""
+    target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+    if record.state is not TaskState.RUNNING:
+        raise StaleTransitionError(f"a move of {event.subtask} while task {record.id} is {record.state}")
+    left = replace(target.attempts[-1], left=event.note, choice=event.choice or target.attempts[-1].choice)
+    return _with(
+        record,
+        replace(
+            target,
+            state=SubtaskState.DISPATCHED,
+            gateway=event.gateway,
+            container="",
+            phase=None,
+            startup_ms=None,
+            duration_ms=None,
+            note=event.note,
+            attempts=(*_faded((*target.attempts[:-1], left)), _attempt(target.next_attempt, event)),
+        ),
+    )
+
+
+def _healed(record: TaskRecord, event: Transition) -> TaskRecord:
+    """Note versions that lost, and fence their attempts off; also of a task that has ended."""
+    subtasks = tuple(
+        replace(each, fence=max(each.fence, event.fences.get(each.subtask.id, 0))) for each in record.subtasks
+    )
+    return replace(record, subtasks=subtasks, splits=event.splits)
 
 
 def _started(record: TaskRecord, event: Transition) -> TaskRecord:
@@ -297,7 +344,7 @@ def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
     if event.failure is None:
         raise StaleTransitionError("a failed attempt without a reason")
-    if target.state is SubtaskState.READY and event.attempt == target.attempt + 1 and event.give_up:
+    if target.state is SubtaskState.READY and event.attempt == target.next_attempt and event.give_up:
         # Given up before it could be sent anywhere: nobody can run it.
         attempts = target.attempts
     else:
@@ -386,6 +433,8 @@ _HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] 
     TransitionKind.CHECKPOINT: _checkpoint,
     TransitionKind.SUCCEEDED: _succeeded,
     TransitionKind.ATTEMPT_FAILED: _attempt_failed,
+    TransitionKind.MOVED: _moved,
+    TransitionKind.HEALED: _healed,
     TransitionKind.CANCEL: _cancel,
 }
 
@@ -417,7 +466,8 @@ def gives_up(target: SubtaskRecord, failure: Failure, *, retries: int) -> bool:
     if not failure.retryable:
         return True
     own = [a for a in target.attempts if a.failure and a.failure.code not in _NOT_ITS_FAULT]
-    others = len(target.attempts) - len(own)
+    # An attempt that was moved away has no failure: it counts for neither.
+    others = sum(not a.left for a in target.attempts) - len(own)
     if failure.code in _NOT_ITS_FAULT:
         return others >= MAX_DISPLACEMENTS
     return len(own) >= retries

@@ -25,13 +25,16 @@ from appliance.model import (
 )
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.surroundings import Input, RunNews, Surroundings, deadline_s, need_of
+from appliance.tasks.surroundings import Input, MoveReady, RunNews, Surroundings, deadline_s, need_of
 
 log = structlog.get_logger(__name__)
 
 ANSWER_S = 0.25
 """How long the end of a run waits for the answer to its order, which says how its container was chosen. It is on its
 way: a run that takes no time can be heard of before it."""
+LEAVE_S = 8.0
+"""How long a run that is left may take to end before the next attempt begins elsewhere: its handler's grace, and
+what it changed in volumes being noted. Beyond that it is fenced off by its attempt number alone."""
 
 
 def request_for(
@@ -48,7 +51,7 @@ def request_for(
     return RunRequest(
         task=record.id,
         subtask=subtask.id,
-        attempt=target.attempt + 1,
+        attempt=target.next_attempt,
         skill=subtask.skill,
         need=need_of(manifest),
         robot=robot,
@@ -60,6 +63,7 @@ def request_for(
         due_s=max(0.001, record.deadline_s - elapsed_s) if record.deadline_s else 0.0,
         submitter=record.submitter,
         group=record.group.members if record.group else (),
+        moves=sum(bool(each.left) for each in target.attempts),
     )
 
 
@@ -82,6 +86,7 @@ class Orders:
         self._around = around
         self._tell = tell
         self._outgoing: list[tuple[str, RunRequest]] = []
+        self._moves: list[tuple[MoveReady, RunRequest, SubtaskRecord]] = []
         self._sending: dict[tuple[str, int], asyncio.Task[object]] = {}
         self._tasks: set[asyncio.Task[object]] = set()
         self._accepted: dict[tuple[str, int], RunAccepted] = {}
@@ -91,8 +96,18 @@ class Orders:
         """Have an order ready for when the record is written."""
         self._outgoing.append((gateway, request))
 
+    def move(self, news: MoveReady, request: RunRequest, *, left: SubtaskRecord) -> None:
+        """Have a run ended and its next attempt ordered elsewhere when the record is written."""
+        self._moves.append((news, replace(request, moves=request.moves + 1), left))
+
     def go(self) -> None:
         """The record is written: send what waited for that."""
+        moves, self._moves = self._moves, []
+        for news, request, left in moves:
+            news.done()
+            # Nobody is asked after the new attempt before it was ordered.
+            self._sent_at[request.subtask] = time.monotonic() + LEAVE_S
+            self._sending[request.subtask, request.attempt] = self._start(self._move(news.gateway, request, left))
         outgoing, self._outgoing = self._outgoing, []
         for gateway, request in outgoing:
             self._sent_at[request.subtask] = time.monotonic()
@@ -132,6 +147,8 @@ class Orders:
 
     def close(self) -> None:
         """Give up what is on its way."""
+        for news, _, _ in self._moves:
+            news.give_up("the task's coordination has ended before it was written")
         for task in self._tasks:
             task.cancel()
 
@@ -158,6 +175,17 @@ class Orders:
             log.exception("run order broke", run=request.run_id, gateway=gateway)
             failure = Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
             self._tell(RunNews(_event(request, gateway, RunEventKind.FAILED, failure)))
+
+    async def _move(self, gateway: str, request: RunRequest, left: SubtaskRecord) -> None:
+        """End the run that is left, so that what it changed is there for the next, then order that."""
+        ask = RunAsk(task=request.task, subtask=request.subtask, attempt=left.attempt)
+        try:
+            await self._around.plane.rpc.call(left.gateway, "run_leave", ask, RunStatus, timeout_s=LEAVE_S)
+        except SwiftbotError as error:
+            # It hears of the record, or is cut off: robots and coordinators refuse its attempt in any case.
+            log.warning("a run that was moved is not known to have ended", run=ask.run_id, reason=str(error))
+        self._sent_at[request.subtask] = time.monotonic()
+        await self._send(gateway, request)
 
     def _start(self, order: Coroutine[Any, Any, object]) -> asyncio.Task[object]:
         task = asyncio.create_task(order)

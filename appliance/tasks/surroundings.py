@@ -1,10 +1,12 @@
 """What a driver needs of its gateway, and what it is told: the seam between driving a task and the world."""
 
+import asyncio
 from collections.abc import Mapping
 from typing import Any, Protocol
 
 from msgspec import Struct
 
+from appliance.errors import RefusedError
 from appliance.model import Need, Plan, RunAccepted, RunEvent, RunRequest, SubtaskRecord, TaskRecord
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import SkillManifest
@@ -79,7 +81,38 @@ class Wake(Struct, frozen=True):
     """Look again: a timer, a new robot, a new gateway."""
 
 
-Input = RunNews | GatewayLost | CancelAsked | Wake
+class MoveReady(Struct, frozen=True, kw_only=True):
+    """A run can be left for a new attempt elsewhere: its gateway holds it, the other one is ready to take it.
+
+    `outcome` becomes the new attempt's number when the record with it is written; an error says why it was not.
+    """
+
+    subtask: str
+    attempt: int
+    next_attempt: int
+    gateway: str
+    why: str
+    placed: str
+    outcome: "asyncio.Future[int]"
+
+    def give_up(self, reason: str) -> None:
+        """Say that it cannot be any more."""
+        if not self.outcome.done():
+            self.outcome.set_exception(RefusedError(reason))
+
+    def done(self) -> None:
+        """Say that the record is written."""
+        if not self.outcome.done():
+            self.outcome.set_result(self.next_attempt)
+
+
+Input = RunNews | GatewayLost | CancelAsked | MoveReady | Wake
+
+
+def figures(plane: Plane, gateway: str) -> dict[str, Any]:
+    """What is known of a gateway that is chosen, for the attempt's record: its load and its ready containers."""
+    status = plane.registry.gateways.get(gateway)
+    return {"load": round(status.load, 3), "free": status.ready} if status is not None else {}
 
 
 def task_key(task: str) -> str:

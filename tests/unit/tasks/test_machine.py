@@ -4,8 +4,9 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from appliance.model import Failure, Group, Phase, Plan, Subtask, SubtaskState, TaskRecord, TaskState
+from appliance.model import Failure, Group, Phase, Plan, Split, Subtask, SubtaskState, TaskRecord, TaskState
 from appliance.tasks import machine
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind, apply
 
@@ -196,3 +197,65 @@ def test_any_sequence_of_events_keeps_the_record_sound(
             assert all(each.state.final for each in record.subtasks) or record.state is TaskState.FAILED
         again = msgspec.json.decode(msgspec.json.encode(record), type=TaskRecord)
         assert again == record
+
+
+def moved(record: TaskRecord, subtask: str, attempt: int = 1, **fields: object) -> TaskRecord:
+    """Move a run away to gw-2."""
+    return step(record, TransitionKind.MOVED, subtask=subtask, attempt=attempt, gateway="gw-2", note="full", **fields)
+
+
+def test_a_move_is_a_new_attempt_elsewhere_that_keeps_what_was_told() -> None:
+    """The old attempt says why it was left, its results are stale; partial result and checkpoint stay for the next."""
+    record = step(dispatched(planned(), "s1"), TransitionKind.STARTED, subtask="s1", attempt=1, gateway="gw-1")
+    record = step(record, TransitionKind.PARTIAL, subtask="s1", attempt=1, result={"seen": 1})
+    record = step(record, TransitionKind.CHECKPOINT, subtask="s1", attempt=1)
+    record = moved(record, "s1", load=0.25, free=3)
+    found = record.of("s1")
+    assert (found.state, found.attempt, found.gateway) == (SubtaskState.DISPATCHED, 2, "gw-2")
+    assert (found.attempts[0].left, found.attempts[0].failure) == ("full", None)
+    assert (found.attempts[1].load, found.attempts[1].free) == (0.25, 3)
+    assert found.partial == {"seen": 1}
+    assert found.checkpoint_ns
+    with pytest.raises(StaleTransitionError):
+        step(record, TransitionKind.SUCCEEDED, subtask="s1", attempt=1, result={})
+    record = step(record, TransitionKind.STARTED, subtask="s1", attempt=2, gateway="gw-2")
+    assert record.of("s1").gateway == "gw-2"
+
+
+def test_a_move_fits_only_a_run_of_a_task_that_goes_on() -> None:
+    """Not a subtask that is ready, nor an outdated attempt, nor a task that is being ended."""
+    record = planned()
+    with pytest.raises(StaleTransitionError):
+        moved(record, "s1")
+    record = dispatched(record, "s1")
+    with pytest.raises(StaleTransitionError):
+        moved(record, "s1", attempt=2)
+    with pytest.raises(StaleTransitionError):
+        moved(step(record, TransitionKind.CANCEL), "s1")
+
+
+@pytest.mark.parametrize("code", ["skill", "unreachable"])
+def test_moves_do_not_use_up_attempts(code: str) -> None:
+    """Neither the retries of the skill nor the bound on attempts lost to gateways."""
+    record = dispatched(planned(), "s1")
+    for attempt in range(1, 20):
+        record = moved(record, "s1", attempt=attempt)
+    failure = Failure(code=code, message="x", retryable=True)
+    target = record.of("s1")
+    judged = replace(target, attempts=(*target.attempts[:-1], replace(target.attempts[-1], failure=failure)))
+    assert not machine.gives_up(judged, failure, retries=2)
+
+
+def test_a_healed_record_numbers_its_attempts_above_those_made_elsewhere() -> None:
+    """After a partition the next attempt is higher than any of either side; a task that has ended takes the note."""
+    split = Split(coordinator="gw-9", sequence=7, state=TaskState.RUNNING, settled=True)
+    record = step(planned(), TransitionKind.HEALED, splits=(split,), fences={"s1": 4})
+    with pytest.raises(StaleTransitionError):
+        dispatched(record, "s1")
+    record = dispatched(record, "s1", attempt=5)
+    assert record.of("s1").attempt == 5
+    for subtask, attempt in (("s1", 5), ("s2", 1), ("s3", 1)):
+        record = dispatched(record, subtask, attempt) if subtask != "s1" else record
+        record = step(record, TransitionKind.SUCCEEDED, subtask=subtask, attempt=attempt)
+    assert record.state is TaskState.SUCCEEDED
+    assert step(record, TransitionKind.HEALED, splits=(split,)).splits == (split,)
