@@ -164,6 +164,12 @@ class Attempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Load of the gateway when it was chosen, 0 to 1: concurrent versions are resolved by it."""
     free: int = 0
     """Ready containers it had then, for the same reason."""
+    robot: str | None = None
+    """The robot it commanded."""
+    cpu_ms: float | None = None
+    """CPU time of its process and of those it waited for, user and system."""
+    peak_mb: float | None = None
+    """Most memory its process held at once, what it shares with the waiting container included."""
 
 
 class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -186,6 +192,10 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The last partial result that its run told, cut to size; gone once there is a result."""
     checkpoint_ns: int = 0
     """When its last checkpoint was kept, from which the next attempt would go on; 0 when there is none."""
+    condition: str = ""
+    """What the monitor finds of the current attempt: `stuck` or `straggling`; empty when nothing."""
+    instead_of: tuple[str, ...] = ()
+    """Skills that were given up in its place before it, oldest first."""
     attempts: tuple[Attempt, ...] = ()
     fence: int = 0
     """Attempts up to this number may have been made by a coordinator whose version lost; the next is above it."""
@@ -247,6 +257,59 @@ class Group(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How it came to be, with the scores, in words."""
 
 
+class RevisionKind(StrEnum):
+    """How a plan was changed after a failure, cheapest first."""
+
+    ROBOT = "robot"
+    """Another robot does what one cannot do any more."""
+    SKILL = "skill"
+    """A skill that its manifest names as an alternative takes the place of one that was given up."""
+    PLAN = "plan"
+    """The decomposer has planned anew what was left."""
+
+
+class Dropped(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A subtask that a revision took out of the plan, as it stood then."""
+
+    id: str
+    skill: str
+    robot: str | None = None
+    state: SubtaskState = SubtaskState.WAITING
+    failure: Failure | None = None
+
+
+class Revision(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A change of a task's plan after a failure. Finished subtasks are in every plan of a task."""
+
+    number: int
+    """Counts a task's revisions from 1."""
+    kind: RevisionKind
+    at_ns: int = 0
+    subtask: str = ""
+    """Whose failure led to it."""
+    why: str = ""
+    """What had failed."""
+    note: str = ""
+    """What was done about it, and why nothing simpler was."""
+    plan: Plan | None = None
+    """The plan before; of the latest revisions only."""
+    dropped: tuple[Dropped, ...] = ()
+    added: tuple[str, ...] = ()
+
+
+class Proposal(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What the decomposer proposes after a failure, until it takes effect or is turned down."""
+
+    plan: Plan
+    """The whole plan as proposed, with ids of its own."""
+    subtask: str
+    """Whose failure led to it."""
+    note: str = ""
+    waits: bool = False
+    """Whether an operator has to agree first."""
+    at_ns: int = 0
+
+
 class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A task as it stands in the DHT under `task/{id}`; its version vector is kept beside it by the store."""
 
@@ -265,7 +328,18 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """None before the first subtask was placed."""
     state: TaskState = TaskState.ACCEPTED
     plan: Plan | None = None
+    handed_in: bool = False
+    """Whether its plan came with it, instead of from the decomposer."""
     subtasks: tuple[SubtaskRecord, ...] = ()
+    proposal: Proposal | None = None
+    revisions: tuple[Revision, ...] = ()
+    """The latest revisions of its plan, oldest first."""
+    revised: int = 0
+    """Revisions of its plan so far."""
+    replans: int = 0
+    """Those of them that the decomposer made."""
+    retired: tuple[str, ...] = ()
+    """Ids of subtasks that revisions took out: effects are known by them, so they are never given again."""
     failure: Failure | None = None
     coordinator: str = ""
     created_ns: int = 0
@@ -341,6 +415,8 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How often the subtask was moved from one gateway to another before."""
     expected_s: float = 0.0
     """How long runs of the skill take by the coordinator's experience; 0 when it has none."""
+    avoid: tuple[str, ...] = ()
+    """Gateways where earlier attempts failed: it is not passed on to them."""
 
     @property
     def run_id(self) -> str:
@@ -359,7 +435,7 @@ class RunAccepted(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class RunEventKind(StrEnum):
-    """What a run tells: `started`, any number of the next four, then `succeeded` or `failed`."""
+    """What a run tells: `started`, any number of the next five, then `succeeded` or `failed`."""
 
     STARTED = "started"
     PROGRESS = "progress"
@@ -367,6 +443,8 @@ class RunEventKind(StrEnum):
     PARTIAL = "partial"
     CHECKPOINT = "checkpoint"
     """`result` is data from which a later attempt can go on."""
+    ALIVE = "alive"
+    """A sign of life and nothing more: the handler said so, or waits for an answer of the appliance."""
     SUCCEEDED = "succeeded"
     FAILED = "failed"
 
@@ -388,6 +466,14 @@ class RunEvent(Struct, frozen=True, kw_only=True, omit_defaults=True):
     startup_ms: float | None = None
     """On `started`: request received to first line of the handler, on the executing gateway's clock."""
     duration_ms: float | None = None
+    cpu_ms: float | None = None
+    """At the end: CPU time of its process and of those it waited for, user and system."""
+    peak_mb: float | None = None
+    """At the end: most memory its process held at once, what it shares with the waiting container included."""
+    number: int = 0
+    """Counts what the executing gateway has published of this attempt, from 1: a listener sees what it has missed."""
+    at_ns: int = 0
+    """When it was published, by the executing gateway's clock."""
     calls: int = 0
     """On `checkpoint`: how many calls the handler had made by then."""
 
@@ -482,6 +568,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     endpoints: tuple[str, ...] = ()
     refused: dict[str, int] = field(default_factory=dict[str, int])
     """Counters of bad input by kind, since start."""
+    monitor: dict[str, int] = field(default_factory=dict[str, int])
+    """What the execution monitor found and did as coordinator, by kind, since start."""
     started_ns: int = 0
     pid: int = 0
 
@@ -559,6 +647,8 @@ class LogLine(Struct, frozen=True, kw_only=True, omit_defaults=True):
     source: str
     event: str
     fields: dict[str, Any] = field(default_factory=dict[str, Any])
+    number: int = 0
+    """Counts a process's lines from 1."""
 
 
 # --- the site: what names in instructions mean ------------------------------------------------------------

@@ -101,7 +101,7 @@ class Hearing:
             case RunEventKind.CHECKPOINT:
                 # The first one is written at once: whoever comes later must know that there is something to remove.
                 keeper.take(keeper.transition(TransitionKind.CHECKPOINT, **common), durable=not target.checkpoint_ns)
-            case RunEventKind.LOG:
+            case RunEventKind.LOG | RunEventKind.ALIVE:
                 pass
 
     def gateway_lost(self, gateway: str) -> None:

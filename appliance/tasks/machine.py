@@ -11,108 +11,24 @@ order, so that folding the logged ones over nothing must give the record that wa
           failed
 
 A subtask: waiting → ready → dispatched → running → succeeded; an attempt that failed and may be repeated goes
-back to ready with the next attempt number; results of other attempts than the current one are stale.
+back to ready with the next attempt number; results of other attempts than the current one are stale. One that is
+given up with `replan` leaves its task running until its plan is revised (`revising`) or cannot be.
 """
 
 from collections.abc import Callable
-from enum import StrEnum
-from typing import Any
 
-from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import SwiftbotError
 from appliance.model import (
-    PLAIN_PRIORITY,
     Attempt,
-    Choice,
     Failure,
-    Group,
-    Phase,
-    Plan,
-    Split,
     SubtaskRecord,
     SubtaskState,
     TaskRecord,
     TaskState,
 )
-
-
-class TransitionKind(StrEnum):
-    """What happened to a task."""
-
-    ACCEPTED = "accepted"
-    PLANNED = "planned"
-    PLAN_FAILED = "plan failed"
-    ADOPTED = "adopted"
-    """Another gateway now coordinates it (takeover)."""
-    GROUPED = "grouped"
-    """Its dynamic group was formed, or formed anew (`group`)."""
-    DISPATCHED = "dispatched"
-    STARTED = "started"
-    PROGRESS = "progress"
-    PARTIAL = "partial"
-    """A run told a partial result (`result`)."""
-    CHECKPOINT = "checkpoint"
-    """A checkpoint of a run was kept, from which the next attempt would go on."""
-    SUCCEEDED = "succeeded"
-    ATTEMPT_FAILED = "attempt failed"
-    MOVED = "moved"
-    """A run in progress was left for a new attempt on another gateway (`gateway`; `note`: why)."""
-    HEALED = "healed"
-    """Versions that lost against this one were found (`splits`); their attempts are fenced off (`fences`)."""
-    CANCEL = "cancel"
-
-
-class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One input of the state machine, as published under `task/{id}/transition`. `sequence` counts from 1."""
-
-    task: str
-    sequence: int
-    kind: TransitionKind
-    at_ns: int
-    coordinator: str
-    instruction: str = ""
-    submitter: str = ""
-    plan: Plan | None = None
-    priority: int = PLAIN_PRIORITY
-    deadline_s: float = 0.0
-    within: tuple[str, ...] = ()
-    group: Group | None = None
-    elapsed_s: float = 0.0
-    """Seconds since the task was accepted (see `TaskRecord.elapsed_s`)."""
-    subtask: str = ""
-    attempt: int = 0
-    robot: str | None = None
-    gateway: str = ""
-    container: str = ""
-    phase: Phase | None = None
-    startup_ms: float | None = None
-    duration_ms: float | None = None
-    progress: float = 0.0
-    note: str = ""
-    result: dict[str, Any] | None = None
-    failure: Failure | None = None
-    placed: str = ""
-    """On `dispatched`: why that gateway."""
-    choice: Choice | None = None
-    """How the container of the attempt was chosen, on the first transition after that was heard."""
-    give_up: bool = False
-    """Of a failed attempt: no further one will be made."""
-    load: float = 0.0
-    """On `dispatched` and `moved`: load of that gateway as the coordinator knew it."""
-    free: int = 0
-    """On `dispatched` and `moved`: ready containers it had."""
-    splits: tuple[Split, ...] = ()
-    """On `healed`: all that the record has of them from now on."""
-    fences: dict[str, int] = {}
-    """On `healed`: by subtask, the highest attempt that may have been made elsewhere."""
-
-
-class StaleTransitionError(SwiftbotError):
-    """The transition does not fit the record: an outdated attempt, a repeated event, a final task."""
-
-    code = "stale"
+from appliance.tasks import revising
+from appliance.tasks.transition import StaleTransitionError, Transition, TransitionKind
 
 
 def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
@@ -139,6 +55,7 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
             deadline_s=event.deadline_s,
             within=event.within,
             plan=event.plan,
+            handed_in=event.plan is not None,
             coordinator=event.coordinator,
             created_ns=event.at_ns,
             updated_ns=event.at_ns,
@@ -218,6 +135,7 @@ def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
             progress=0.0,
             note=event.note,
             failure=None,
+            condition="",
             attempts=(
                 *_faded(target.attempts),
                 _attempt(event.attempt, event),
@@ -227,7 +145,14 @@ def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
 
 
 def _attempt(number: int, event: Transition) -> Attempt:
-    return Attempt(number=number, gateway=event.gateway, placed=event.placed, load=event.load, free=event.free)
+    return Attempt(
+        number=number,
+        gateway=event.gateway,
+        placed=event.placed,
+        load=event.load,
+        free=event.free,
+        robot=event.robot,
+    )
 
 
 def _moved(record: TaskRecord, event: Transition) -> TaskRecord:
@@ -247,7 +172,11 @@ def _moved(record: TaskRecord, event: Transition) -> TaskRecord:
             startup_ms=None,
             duration_ms=None,
             note=event.note,
-            attempts=(*_faded((*target.attempts[:-1], left)), _attempt(target.next_attempt, event)),
+            condition="",
+            attempts=(
+                *_faded((*target.attempts[:-1], left)),
+                replace(_attempt(target.next_attempt, event), robot=target.bound_robot),
+            ),
         ),
     )
 
@@ -286,6 +215,8 @@ def _served(target: SubtaskRecord, event: Transition) -> tuple[Attempt, ...]:
         container=event.container or last.container,
         phase=event.phase or last.phase,
         choice=event.choice or last.choice,
+        cpu_ms=event.cpu_ms,
+        peak_mb=event.peak_mb,
     )
     return (*target.attempts[:-1], attempt)
 
@@ -329,6 +260,7 @@ def _succeeded(record: TaskRecord, event: Transition) -> TaskRecord:
         state=SubtaskState.SUCCEEDED,
         progress=1.0,
         note="",
+        condition="",
         partial=None,
         result=event.result or {},
         duration_ms=event.duration_ms,
@@ -349,13 +281,21 @@ def _attempt_failed(record: TaskRecord, event: Transition) -> TaskRecord:
         attempts = target.attempts
     else:
         target = _current(record, event, SubtaskState.DISPATCHED, SubtaskState.RUNNING)
-        last = replace(target.attempts[-1], failure=event.failure, choice=event.choice or target.attempts[-1].choice)
+        last = replace(
+            target.attempts[-1],
+            failure=event.failure,
+            choice=event.choice or target.attempts[-1].choice,
+            cpu_ms=event.cpu_ms,
+            peak_mb=event.peak_mb,
+        )
         attempts = (*target.attempts[:-1], last)
     ended = replace(target, attempts=attempts, failure=event.failure, duration_ms=event.duration_ms, note="")
     if record.state is TaskState.CANCELLING:
         return _with(record, replace(ended, state=SubtaskState.CANCELLED))
     if not event.give_up:
         return _with(record, replace(ended, state=SubtaskState.READY, note=f"repeats: {event.failure.message}"))
+    if event.replan:
+        return _with(record, replace(ended, state=SubtaskState.FAILED, note="is to be replanned"))
     failure = replace(event.failure, message=f"{event.subtask} ({target.subtask.skill}): {event.failure.message}")
     failed = _with(record, replace(ended, state=SubtaskState.FAILED))
     return _stop_rest(replace(failed, state=TaskState.CANCELLING, failure=failure))
@@ -436,6 +376,13 @@ _HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] 
     TransitionKind.MOVED: _moved,
     TransitionKind.HEALED: _healed,
     TransitionKind.CANCEL: _cancel,
+    TransitionKind.NOTICED: revising.noticed,
+    TransitionKind.REBOUND: revising.revised,
+    TransitionKind.SUBSTITUTED: revising.revised,
+    TransitionKind.PROPOSED: revising.proposed,
+    TransitionKind.AGREED: revising.agreed,
+    TransitionKind.REPLANNED: revising.revised,
+    TransitionKind.REPLAN_FAILED: revising.replan_failed,
 }
 
 

@@ -1,0 +1,106 @@
+"""The inputs of the task state machine: what can happen to a task, as it is published and logged."""
+
+from enum import StrEnum
+from typing import Any
+
+from msgspec import Struct
+
+from appliance.errors import SwiftbotError
+from appliance.model import PLAIN_PRIORITY, Choice, Failure, Group, Phase, Plan, Split
+
+
+class TransitionKind(StrEnum):
+    """What happened to a task."""
+
+    ACCEPTED = "accepted"
+    PLANNED = "planned"
+    PLAN_FAILED = "plan failed"
+    ADOPTED = "adopted"
+    """Another gateway now coordinates it (takeover)."""
+    GROUPED = "grouped"
+    """Its dynamic group was formed, or formed anew (`group`)."""
+    DISPATCHED = "dispatched"
+    STARTED = "started"
+    PROGRESS = "progress"
+    PARTIAL = "partial"
+    """A run told a partial result (`result`)."""
+    CHECKPOINT = "checkpoint"
+    """A checkpoint of a run was kept, from which the next attempt would go on."""
+    SUCCEEDED = "succeeded"
+    ATTEMPT_FAILED = "attempt failed"
+    MOVED = "moved"
+    """A run in progress was left for a new attempt on another gateway (`gateway`; `note`: why)."""
+    HEALED = "healed"
+    """Versions that lost against this one were found (`splits`); their attempts are fenced off (`fences`)."""
+    CANCEL = "cancel"
+    NOTICED = "noticed"
+    """The monitor has found something of a subtask (`condition`, `note`), or says how its replanning stands."""
+    REBOUND = "rebound"
+    """Another robot (`robot`) takes over what one cannot do any more; `plan` is the plan from now on."""
+    SUBSTITUTED = "substituted"
+    """An alternative skill takes the place of one that was given up; `plan` is the plan from now on."""
+    PROPOSED = "proposed"
+    """The decomposer has planned anew (`plan`, as it gave it); with `waits` an operator has to agree first."""
+    AGREED = "agreed"
+    """An operator agrees to what was proposed."""
+    REPLANNED = "replanned"
+    """What was proposed takes effect; `plan` is the plan from now on, with all that is finished."""
+    REPLAN_FAILED = "replan failed"
+    """Nothing could be done about a subtask that was given up: the task fails with its failure."""
+
+
+class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One input of the state machine, as published under `task/{id}/transition`. `sequence` counts from 1."""
+
+    task: str
+    sequence: int
+    kind: TransitionKind
+    at_ns: int
+    coordinator: str
+    instruction: str = ""
+    submitter: str = ""
+    plan: Plan | None = None
+    priority: int = PLAIN_PRIORITY
+    deadline_s: float = 0.0
+    within: tuple[str, ...] = ()
+    group: Group | None = None
+    elapsed_s: float = 0.0
+    """Seconds since the task was accepted (see `TaskRecord.elapsed_s`)."""
+    subtask: str = ""
+    attempt: int = 0
+    robot: str | None = None
+    gateway: str = ""
+    container: str = ""
+    phase: Phase | None = None
+    startup_ms: float | None = None
+    duration_ms: float | None = None
+    progress: float = 0.0
+    note: str = ""
+    result: dict[str, Any] | None = None
+    failure: Failure | None = None
+    placed: str = ""
+    """On `dispatched`: why that gateway."""
+    choice: Choice | None = None
+    """How the container of the attempt was chosen, on the first transition after that was heard."""
+    give_up: bool = False
+    """Of a failed attempt: no further one will be made."""
+    load: float = 0.0
+    """On `dispatched` and `moved`: load of that gateway as the coordinator knew it."""
+    free: int = 0
+    """On `dispatched` and `moved`: ready containers it had."""
+    splits: tuple[Split, ...] = ()
+    """On `healed`: all that the record has of them from now on."""
+    fences: dict[str, int] = {}
+    """On `healed`: by subtask, the highest attempt that may have been made elsewhere."""
+    replan: bool = False
+    """Of an attempt that is given up: the task goes on, and its plan is to be revised."""
+    condition: str = ""
+    waits: bool = False
+    cpu_ms: float | None = None
+    peak_mb: float | None = None
+
+
+class StaleTransitionError(SwiftbotError):
+    """The transition does not fit the record: an outdated attempt, a repeated event, a final task."""
+
+    code = "stale"
