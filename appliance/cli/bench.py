@@ -269,6 +269,42 @@ def dht(
 
 
 @bench_app.command
+def members(
+    *,
+    members: int = 300,
+    per_process: int = 50,
+    view: tuple[Literal["full", "bounded"], ...] = ("full", "bounded"),
+    rounds: int = 5,
+    count: int = 500,
+    idle_s: float = 10.0,
+    lease_ms: int = 10_000,
+    as_json: Json = False,
+) -> int:
+    """A large fleet on this machine: members (ring, registry, records; no pool) behind one router, and their costs.
+
+    Memory and idle CPU of a member and of the router, the time until a new member is known and a killed one forgotten
+    everywhere, and the times of record reads and writes.
+
+    Args:
+        members: How many.
+        per_process: Members that share a process.
+        view: Full: each knows all; bounded: 4·log2 of their number (`plane.view`). Several one after the other.
+        rounds: New members, each killed again.
+        count: Records written and read.
+        idle_s: How long idle CPU is taken over.
+        lease_ms: `plane.lease_ms` of all.
+    """
+    from appliance.bench.members.run import Options, run
+
+    options = Options(
+        members=members, per_process=per_process, views=view, rounds=rounds, count=count, idle_s=idle_s,
+        lease_ms=lease_ms,
+    )  # fmt: skip
+    tell(measure(run(options, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
 def policy(
     *,
     traces: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),

@@ -41,6 +41,7 @@ def router(
     *,
     listen: tuple[str, ...] = ("tcp/[::]:7447",),
     connect: tuple[str, ...] = (),
+    lease_ms: int = 1000,
     log_format: Literal["json", "text"] = "json",
 ) -> int:
     """Run a router until SIGTERM or Ctrl-C: for fleets too large for links from each gateway to each.
@@ -52,6 +53,7 @@ def router(
         listen: Endpoint to accept links on; may be given several times.
         connect: Endpoint of another router to keep linked to; may be given several times. A line or star of three to
             five routers is enough.
+        lease_ms: A link silent for so long is dead; as the gateways have it in `plane.lease_ms`.
         log_format: json for journald and machines, text for a terminal.
     """
     from appliance.plane.router import run_router
@@ -60,7 +62,7 @@ def router(
     logs.configure(style=log_format)
 
     async def go() -> None:
-        plane = PlaneConfig(mode="router", listen=listen, connect=connect)
+        plane = PlaneConfig(mode="router", listen=listen, connect=connect, lease_ms=lease_ms)
         await run_router(plane, stop=_until_signalled(), ready=lambda _: service.ready(), alive=service.alive)
 
     uvloop.run(go())

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import random
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -71,7 +72,20 @@ class Plane:
             pulse=self._pulse,
         )
         self.rpc.register("member", MemberAsk, self._on_member, exchange=False)
+        self.on_member_joined: list[Callable[[str], None]] = self._membership.on_joined
         self.on_member_lost: list[Callable[[str], None]] = self._membership.on_lost
+        self.milestones: dict[str, float] = {}
+        """When on this machine's monotonic clock, seconds: `session` was open, `store`; `joined`: the others can see
+        it; `reconciled`: it answers for its keys with its shard compared."""
+        self.dht.on_ring_change.append(lambda: self._reached("reconciled"))
+
+    def _reached(self, milestone: str) -> None:
+        if milestone in self.milestones:
+            return
+        self.milestones[milestone] = now = time.monotonic()
+        if milestone == "reconciled":
+            opened = self.milestones.get("session", now)
+            log.info("back in the ring", gateway=self.gateway, after_open_ms=round((now - opened) * 1e3, 1))
 
     @classmethod
     async def open(cls, config: PlaneConfig, *, fleet: str, gateway: str, data_dir: Path) -> "Plane":
@@ -83,11 +97,14 @@ class Plane:
         """
         check_name(gateway, "gateway")
         session = await Session.open(config, fleet)
+        opened = time.monotonic()
         store: Store | None = None
         plane: Plane | None = None
         try:
             store = await Store.open(data_dir / STORE_FILE)
             plane = cls(config, session=session, store=store, gateway=gateway)
+            plane.milestones["session"] = opened
+            plane._reached("store")
             await plane._join()
         except BaseException:
             if plane is not None:
@@ -116,6 +133,7 @@ class Plane:
         await membership.enter()
         await self._reconciler.join()
         membership.join()
+        self._reached("joined")
         self._reconciler.start()
         log.info("joined", gateway=self.gateway, members=sorted(membership.members))
 
@@ -159,6 +177,10 @@ class Plane:
     def members(self) -> frozenset[str]:
         """Ids of the gateways that are there, this one among them."""
         return self._membership.members
+
+    async def holders(self, key: str, n: int) -> tuple[str, ...]:
+        """The first `n` gateways from a key's position on, its owner first; UnreachableError when nobody knows."""
+        return await self._membership.holders(key, n)
 
     async def close(self) -> None:
         """Leave the fleet and close the store; more than once does no harm."""
