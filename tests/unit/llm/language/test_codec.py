@@ -87,9 +87,30 @@ def test_every_plan_comes_back(answer: Answer, instruction: str) -> None:
 
 
 SYMBOLS = st.sampled_from(
-    ["navigation", "none", "goto", "place:", "w0", "w1", "w9", "w999", "|", "<", "1", "2", "[", "]", "+", "~", "@",
-     '"x"', '"', "any", "operator", "notify", "to:", "form_up", "robots:", "formation:", "3.5", "", "hold", "duration_s:"]
-)  # fmt: skip
+    [
+        *(
+            "navigation",
+            "none",
+            "goto",
+            "place:",
+            "w0",
+            "w1",
+            "w9",
+            "w999",
+            "|",
+            "<",
+            "1",
+            "2",
+            "[",
+            "]",
+            "+",
+            "~",
+            "@",
+        ),
+        *('"x"', '"', "any", "operator", "notify", "to:", "form_up", "robots:", "formation:", "3.5", "", "hold"),
+        "duration_s:",
+    ]
+)
 
 
 @given(st.lists(SYMBOLS, max_size=20))
