@@ -1,22 +1,26 @@
 """The books of the pool: which containers there are, who has which, and who waits for one.
 
 It exists apart from the keeper because these few rules must hold at every step between two awaits: a container has
-one holder, a hold that is not used ends, and those who wait are served in their order. Nothing here starts or ends
-a container, and nothing here is awaited but one's turn.
+one holder, a hold that is not used ends, and those who wait are served in their order (`turns`). Nothing here starts
+or ends a container, and nothing here is awaited but one's turn.
 """
 
 import asyncio
 import itertools
 import math
+import sys
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 
-from appliance.errors import PoolError, SwiftbotError
+from msgspec.structs import replace
+
+from appliance.errors import PoolError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool.container import PooledContainer
 from appliance.pool.selection import best_local
 from appliance.pool.settings import PoolConfig
+from appliance.pool.turns import Turn, Turns
 
 FOR_A_RUN = "cold"
 """Reservation of a container that is started for one waiting run."""
@@ -27,11 +31,18 @@ FOR_STATE = "state"
 """Reservation of a container whose run waits for the newest state of its volumes."""
 
 
+class WithdrawnError(SwiftbotError):
+    """A run was taken out of the queue here, because it may go elsewhere. It has not begun."""
+
+    code = "withdrawn"
+
+
 class _Waiter:
     """Somebody in the queue."""
 
-    def __init__(self, need: Need) -> None:
+    def __init__(self, need: Need, turn: Turn) -> None:
         self.need = need
+        self.turn = turn
         self.got: asyncio.Future[PooledContainer] = asyncio.get_running_loop().create_future()
 
 
@@ -59,10 +70,14 @@ class Books:
         self._refused = refused
         self._held: dict[str, PooledContainer] = {}
         self._facts: tuple[ContainerInfo, ...] | None = ()
-        self._waiting: deque[_Waiter] = deque()
+        self._waiting: dict[int, _Waiter] = {}
+        """By the numbers of their turns."""
+        self._turns = Turns()
         self._watchers: set[asyncio.Event] = set()
         self._telling = False
         self._numbers = itertools.count(1)
+        self.full: Callable[[], RefusedError] = lambda: RefusedError("too many runs wait for a container")
+        """What is told to one for whom there is no place in the queue."""
 
     # --- what is --------------------------------------------------------------------------------------------
 
@@ -115,7 +130,7 @@ class Books:
 
     def send_away(self) -> None:
         """Let nobody wait any more."""
-        for waiter in self._waiting:
+        for waiter in self._waiting.values():
             waiter.got.cancel()
 
     def clear(self) -> None:
@@ -218,15 +233,51 @@ class Books:
 
     # --- the queue --------------------------------------------------------------------------------------------
 
-    async def wait(self, need: Need) -> PooledContainer:
+    def waiting(self) -> list[tuple[Turn, Need]]:
+        """Return those who wait in the order in which they will be served."""
+        needs = {each.turn.number: each.need for each in self._waiting.values() if not each.got.done()}
+        order = self._turns.order((self._waiting[number].turn for number in needs), time.monotonic())
+        return [(turn, needs[turn.number]) for turn in order]
+
+    def would_be_last(self, turn: Turn) -> bool:
+        """Whether all who wait would be served before one who comes now."""
+        return not self._waiting or self._last(replace(turn, number=sys.maxsize)).number == sys.maxsize
+
+    def _last(self, turn: Turn) -> Turn:
+        waiting = [each.turn for each in self._waiting.values() if not each.got.done()]
+        return self._turns.order([*waiting, turn], time.monotonic())[-1]
+
+    def withdraw(self, run_id: str) -> bool:
+        """Take a run out of the queue, unless it has been served: whoever waits for it gets a WithdrawnError."""
+        for waiter in self._waiting.values():
+            if waiter.turn.id == run_id and not waiter.got.done():
+                waiter.got.set_exception(WithdrawnError(f"{run_id} was taken out of the queue"))
+                return True
+        return False
+
+    def _take_a_place(self, need: Need, turn: Turn) -> _Waiter:
+        """Join the queue; a full one turns away whoever would be served last, be it the one who comes."""
+        waiting = [each for each in self._waiting.values() if not each.got.done()]
+        if len(waiting) >= self._config.queue and waiting:
+            last = self._last(turn)
+            self._refused["queue full"] += 1
+            if last.number == turn.number:
+                raise self.full()
+            self._waiting[last.number].got.set_exception(self.full())
+        waiter = self._waiting[turn.number] = _Waiter(need, turn)
+        return waiter
+
+    async def wait(self, need: Need, turn: Turn | None = None) -> PooledContainer:
         """Wait in the queue for a container, which may be one that is only starting.
 
         Raises:
             PoolError: none came free in time.
+            RefusedError: the queue is full of those who go before this one.
+            WithdrawnError: `withdraw` was called.
             SwiftbotError: the start that was begun for it would be in vain.
         """
-        waiter = _Waiter(need)
-        self._waiting.append(waiter)
+        turn = turn or Turn(id="", number=0, since=time.monotonic())
+        waiter = self._take_a_place(need, replace(turn, number=next(self._numbers)))
         try:
             async with asyncio.timeout(self._config.queue_wait_s):
                 try:
@@ -241,16 +292,17 @@ class Books:
                 f"no container came free within {self._config.queue_wait_s:g} s", remedy="raise pool.capacity"
             ) from error
         finally:
-            self._waiting.remove(waiter)
+            del self._waiting[waiter.turn.number]
 
     def serve(self) -> None:
-        """Hand what is ready, or a start that there is room for, to those who wait, first come first served."""
+        """Hand what is ready, or a start that there is room for, to those who wait, in their turns."""
         if not self._waiting:
             return
         # Handing out only takes: what could not be had for one need cannot be had for another like it just after.
         in_vain: set[Need] = set()
-        for waiter in tuple(self._waiting):
-            if waiter.got.done() or waiter.need in in_vain:
+        for turn, need in self.waiting():
+            waiter = self._waiting[turn.number]
+            if waiter.got.done() or need in in_vain:
                 continue
             container = self.take(waiter.need)
             if container is None:
@@ -262,4 +314,5 @@ class Books:
             if container is None:
                 in_vain.add(waiter.need)
             else:
+                self._turns.served(turn)
                 waiter.got.set_result(container)

@@ -31,6 +31,7 @@ from appliance.pool.pressure import MemoryWatch, Reading
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 from appliance.pool.starts import Starts
+from appliance.pool.turns import Completions, Turn
 
 log = structlog.get_logger(__name__)
 
@@ -74,6 +75,8 @@ class Keeper:
     ) -> None:
         self.decisions = Decisions()
         self.books = Books(config, begin=self._begin, on_change=on_change, refused=refused)
+        self.books.full = self._full
+        self._completions = Completions()
         self.link = EngineLink(make_engine, reconnect_s=config.reconnect_s, on_connected=self._on_connected)
         self._config = config
         self._gateway = gateway
@@ -115,7 +118,7 @@ class Keeper:
         squeeze = self._memory.squeeze
         return squeeze.reason and f"{squeeze.reason}: {squeeze.budget_mb} of {self._config.memory_mb} MB for containers"
 
-    def check_startable(self, need: Need) -> None:
+    def check_startable(self, need: Need, turn: Turn | None = None) -> None:
         """Raise when a cold start now would be in vain.
 
         Raises:
@@ -124,12 +127,25 @@ class Keeper:
         """
         self._check_image(need.image)
         if self.books.queue >= self._config.queue and self._room(self._size_mb(need), for_run=True) is None:
+            # A full queue turns away whoever would be served last, which need not be the one who comes.
+            if turn is not None and self.books.queue and not self.books.would_be_last(turn):
+                return
             self._refused["queue full"] += 1
-            raise RefusedError(
-                f"all {len(self.books)} containers of {self._gateway} are busy and {self.books.queue} runs wait"
-                + (f"; {self.squeeze}" if self.squeeze else ""),
-                remedy="wait, or raise pool.capacity",
-            )
+            raise self._full()
+
+    def _full(self) -> RefusedError:
+        after_s = self.expected_s(self.books.queue + 1)
+        when = "wait" if after_s is None else f"ask again in about {after_s:.1f} s"
+        return RefusedError(
+            f"all {len(self.books)} containers of {self._gateway} are busy and {self.books.queue} runs wait"
+            + (f"; {self.squeeze}" if self.squeeze else ""),
+            remedy=f"{when}, or raise pool.capacity",
+            retry_after_s=after_s or 0.0,
+        )
+
+    def expected_s(self, position: int) -> float | None:
+        """In how many seconds the run at a place in the queue (from 1) may have a container; None: not known."""
+        return self._completions.expected_s(position, len(self.books))
 
     def _check_image(self, image: str) -> None:
         if self.link.problem:
@@ -167,6 +183,8 @@ class Keeper:
 
     def ended(self, image: str, held_s: float) -> None:
         """Note that a run that had arrived is over, having had its container for so long (0: it had none)."""
+        if held_s > 0:
+            self._completions.ended(held_s)
         self._planner.ended(image, held_s, time.monotonic())
 
     async def have(self, image: str, count: int) -> None:
@@ -277,19 +295,20 @@ class Keeper:
 
     # --- starting ---------------------------------------------------------------------------------------------
 
-    async def acquire(self, need: Need) -> PooledContainer:
+    async def acquire(self, need: Need, turn: Turn | None = None) -> PooledContainer:
         """Start a container, or wait for one when there is no room. Its reservation tells a new one: FOR_A_RUN.
 
         Raises:
             PoolError, PrerequisiteError, UnreachableError: none started, or none came free in time.
             RefusedError: too many wait already.
+            WithdrawnError: it was taken out of the queue (`Books.withdraw`).
         """
         if (container := self.books.take(need)) is not None:
             return container  # it came free meanwhile
-        self.check_startable(need)
+        self.check_startable(need, turn)
         container = self._begin(need)
         if container is None:
-            container = await self.books.wait(need)
+            container = await self.books.wait(need, turn)
         if container.info.state is ContainerState.STARTING:
             try:
                 error = await self.starts.wait(container)

@@ -33,6 +33,7 @@ from appliance.pool.selection import Candidate, Decision, Facts, select
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 from appliance.pool.state import ALONE, State
+from appliance.pool.turns import Turn, turn_of
 from appliance.pool.verbs import Verbs, unknown_image
 from appliance.skills.catalogue import Catalogue
 
@@ -184,6 +185,7 @@ class Pool:
         allow_remote: bool,
         inputs: Mapping[str, int] | None = None,
         avoid: Mapping[str, str] | None = None,
+        turn: Turn | None = None,
     ) -> Decision:
         """Decide where a subtask runs (Algorithm 1); a local container is reserved for the lease.
 
@@ -192,6 +194,7 @@ class Pool:
             allow_remote: whether other gateways may be asked (phase 2).
             inputs: bytes of the subtask's input files by the gateway that holds them.
             avoid: gateways whose containers are not to be used, with the reason.
+            turn: who asks: a full queue has a place for one who would not be served last.
 
         Raises:
             NotFoundError: there is no such image.
@@ -212,7 +215,7 @@ class Pool:
                 log.info("other gateways could not be asked", reason=str(error) or "too slow")
             decision = self._choose(need, offers, facts)
         if decision.phase is Phase.COLD:
-            self._keeper.check_startable(need)
+            self._keeper.check_startable(need, turn)
         elif decision.phase is Phase.LOCAL_WARM and decision.container is not None:
             return msgspec.structs.replace(decision, reservation=self._keeper.books.reserve(decision.container))
         return decision
@@ -238,19 +241,28 @@ class Pool:
 
     # --- running --------------------------------------------------------------------------------------------
 
-    async def run(self, request: RunRequest, decision: Decision, on_event: Callable[[RunEvent], None]) -> RunEvent:
+    async def run(
+        self,
+        request: RunRequest,
+        decision: Decision,
+        on_event: Callable[[RunEvent], None],
+        *,
+        turn: Turn | None = None,
+    ) -> RunEvent:
         """Run one attempt of a subtask here, warm or cold, to its end.
 
         Args:
             request: what to run.
             decision: what `select` said; if its container is gone, another is taken or started.
             on_event: gets every event but the last, in order, on the event loop.
+            turn: its place among those who wait; by default it comes now.
 
         Returns:
             The last event, `succeeded` or `failed`. Its `phase` is what really happened.
 
         Raises:
             RefusedError, NotFoundError, PoolError, PrerequisiteError, UnreachableError: it was not begun, and why.
+            WithdrawnError: it was taken out of the queue (`withdraw`); it was not begun.
         """
         self._check(request.need)
         skill = self._catalogue.skills.get(request.skill)
@@ -259,7 +271,19 @@ class Pool:
             raise NotFoundError(f"skill {request.skill[:60]!r} is not implemented here", remedy="see docs/skills.md")
         if decision.phase is Phase.REMOTE_WARM and decision.gateway != self.gateway:
             raise RefusedError(f"the container chosen is on {decision.gateway}", remedy="send the run there")
-        return await self._runs.run(request, decision, on_event)
+        return await self._runs.run(request, decision, on_event, turn or turn_of(request))
+
+    def waiting(self) -> list[tuple[Turn, Need]]:
+        """Return the runs that wait for a container, in the order in which they will be served; ids are run ids."""
+        return self._keeper.books.waiting()
+
+    def withdraw(self, run_id: str) -> bool:
+        """Take a run out of the queue if it still waits there: `run` raises WithdrawnError. It has not begun."""
+        return self._keeper.books.withdraw(run_id)
+
+    def expected_s(self, position: int) -> float | None:
+        """In how many seconds the run at a place in the queue (from 1) may have a container; None: not known."""
+        return self._keeper.expected_s(position)
 
     async def cancel(self, run_id: str) -> bool:
         """Ask a run to end; its last event follows from `run`. False when there is none of that id."""

@@ -20,6 +20,7 @@ from appliance.pool.keeper import Keeper
 from appliance.pool.selection import Decision
 from appliance.pool.settings import PoolConfig
 from appliance.pool.state import State
+from appliance.pool.turns import Turn
 
 BACKSTOP_S = 3.0
 """How much longer than the runner itself the pool waits for a run to end, before it ends the container."""
@@ -30,7 +31,8 @@ TRIES = 3
 class _Run:
     """A run in progress here."""
 
-    def __init__(self) -> None:
+    def __init__(self, turn: Turn) -> None:
+        self.turn = turn
         self.cancelled = False
         self.acquiring: asyncio.Task[PooledContainer] | None = None
         self.container: PooledContainer | None = None
@@ -66,12 +68,14 @@ class Runs:
         """How long a run that was told to end may take to."""
         return self._config.cancel_grace_s + 2 * BACKSTOP_S
 
-    async def run(self, request: RunRequest, decision: Decision, on_event: Callable[[RunEvent], None]) -> RunEvent:
+    async def run(
+        self, request: RunRequest, decision: Decision, on_event: Callable[[RunEvent], None], turn: Turn
+    ) -> RunEvent:
         """Carry out one attempt to its end; see `Pool.run`."""
         entered_ns = time.monotonic_ns()
         if request.run_id in self._runs:
             raise RefusedError(f"run {request.run_id} is in progress here")
-        run = self._runs[request.run_id] = _Run()
+        run = self._runs[request.run_id] = _Run(turn)
         self._idle.clear()
         self._keeper.arrived(request.need.image)
         try:
@@ -140,7 +144,9 @@ class Runs:
 
     async def _prepare(self, request: RunRequest, claimed: PooledContainer | None, run: _Run) -> PooledContainer:
         """Wait for a container and for the newest state of the volumes; an operator may cancel that."""
-        run.acquiring = asyncio.create_task(self._have(request.need, claimed), name=f"prepare {request.run_id}")
+        run.acquiring = asyncio.create_task(
+            self._have(request.need, claimed, run.turn), name=f"prepare {request.run_id}"
+        )
         try:
             return await run.acquiring
         except asyncio.CancelledError:
@@ -152,15 +158,15 @@ class Runs:
                 raise
             raise CancelledByOperatorError(f"{request.run_id} was cancelled before it began") from None
 
-    async def _have(self, need: Need, claimed: PooledContainer | None) -> PooledContainer:
+    async def _have(self, need: Need, claimed: PooledContainer | None, turn: Turn) -> PooledContainer:
         if not need.volumes:
-            return claimed or await self._keeper.acquire(need)
+            return claimed or await self._keeper.acquire(need, turn)
         if claimed is not None:
             self._keeper.books.keep(claimed)
         # State comes while the container starts; both may take seconds.
         bringing = asyncio.ensure_future(self._state.bring(need.volumes))
         try:
-            container = claimed = claimed or await self._keeper.acquire(need)
+            container = claimed = claimed or await self._keeper.acquire(need, turn)
             self._keeper.books.keep(container)
             await bringing
         except BaseException:

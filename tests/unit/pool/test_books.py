@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from appliance.errors import RefusedError
 from appliance.model import ContainerInfo, ContainerState, Need
-from appliance.pool.books import Books
+from appliance.pool.books import Books, WithdrawnError
 from appliance.pool.container import PooledContainer
 from appliance.pool.settings import PoolConfig
+from appliance.pool.turns import Turn
 
 pytestmark = pytest.mark.anyio
 
@@ -42,3 +44,78 @@ async def test_a_long_queue_asks_for_room_once_for_each_need() -> None:
     for each in waiting:
         each.cancel()
     await asyncio.gather(*waiting, return_exceptions=True)
+
+
+NEED = Need(image="base")
+
+
+def full_books(queue: int = 32) -> Books:
+    """Return books without a container, and without room for one."""
+    return Books(PoolConfig(queue=queue), begin=lambda _: None, on_change=lambda _: None, refused=Counter())
+
+
+async def queued(books: Books, *turns: Turn) -> dict[str, "asyncio.Task[PooledContainer]"]:
+    """Have them wait, in this order."""
+    waiting = {turn.id: asyncio.create_task(books.wait(NEED, turn)) for turn in turns}
+    for _ in range(3):
+        await asyncio.sleep(0)
+    return waiting
+
+
+async def end(waiting: dict[str, "asyncio.Task[PooledContainer]"]) -> None:
+    """Have nobody wait any more."""
+    for each in waiting.values():
+        each.cancel()
+    await asyncio.gather(*waiting.values(), return_exceptions=True)
+
+
+async def test_a_free_container_goes_to_whose_turn_it_is() -> None:
+    """By priority, then in turns between submitters, and not by who came first; positions are told in that order."""
+    books = full_books()
+    waiting = await queued(
+        books,
+        *(Turn(id=f"flood{number}", submitter="flood") for number in range(3)),
+        Turn(id="other", submitter="other"),
+        Turn(id="urgent", submitter="flood", priority=9),
+    )
+    told = [turn.id for turn, _ in books.waiting()]
+    assert told[0] == "urgent"
+    assert told.index("other") <= 2
+    served: list[str] = []
+    for number in range(len(waiting)):
+        books.add(container(f"c{number}", "base"))
+        books.serve()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        served += [name for name, task in waiting.items() if task.done() and name not in served]
+    assert served == told
+
+
+async def test_a_full_queue_turns_away_whoever_would_be_served_last() -> None:
+    """A flood that fills the queue makes room for another submitter; one that would be last is refused itself."""
+    books = full_books(queue=3)
+    waiting = await queued(books, *(Turn(id=f"flood{number}", submitter="flood") for number in range(3)))
+    assert not books.would_be_last(Turn(id="other", submitter="other"))
+    assert books.would_be_last(Turn(id="flood3", submitter="flood"))
+    waiting |= await queued(books, Turn(id="other", submitter="other"))
+    with pytest.raises(RefusedError):
+        await waiting["flood2"]
+    with pytest.raises(RefusedError):
+        await books.wait(NEED, Turn(id="flood3", submitter="flood"))
+    assert {turn.id for turn, _ in books.waiting()} == {"flood0", "flood1", "other"}
+    await end(waiting)
+
+
+async def test_a_run_is_withdrawn_once_and_only_while_it_waits() -> None:
+    """After that it has no container and gets none; one that was served meanwhile stays."""
+    books = full_books()
+    waiting = await queued(books, Turn(id="a"), Turn(id="b"))
+    assert books.withdraw("a")
+    assert not books.withdraw("a")
+    books.add(container("c1", "base"))
+    books.serve()
+    assert not books.withdraw("b"), "it has been handed a container"
+    with pytest.raises(WithdrawnError):
+        await waiting["a"]
+    assert (await waiting["b"]).id == "c1"
+    assert books.queue == 0
