@@ -186,7 +186,7 @@ class _Starting:
                 for drone in range(order.mavlink)
                 if drone % order.gateways == index
             )
-            config = self._config(name, endpoints, index, links, record_dir)
+            config = self._config(names, endpoints, index, links, record_dir)
             path = directory / name / "gateway.toml"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(configuration.dump(config))
@@ -238,8 +238,14 @@ class _Starting:
         return state
 
     def _config(
-        self, name: str, endpoints: tuple[str, ...], index: int, links: tuple[MavlinkLink, ...], record_dir: Path
+        self,
+        names: tuple[str, ...],
+        endpoints: tuple[str, ...],
+        index: int,
+        links: tuple[MavlinkLink, ...],
+        record_dir: Path,
     ) -> GatewayConfig:
+        name = names[index]
         base = self._order.base or GatewayConfig(id=name)
         return msgspec.structs.replace(
             base,
@@ -250,6 +256,7 @@ class _Starting:
             plane=PlaneConfig(
                 listen=(endpoints[index],),
                 connect=tuple(endpoint for at, endpoint in enumerate(endpoints) if at != index),
+                voters=names,
             ),
             pool=self._order.pool_of(name),
             robots=msgspec.structs.replace(base.robots, mavlink=links),

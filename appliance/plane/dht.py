@@ -20,6 +20,7 @@ from appliance.errors import ConflictError, DeadlineError, RefusedError, Swiftbo
 from appliance.model import VersionVector
 from appliance.plane.membership import Membership
 from appliance.plane.pulse import Pulse
+from appliance.plane.quorum.voting import Voting
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
@@ -76,11 +77,38 @@ class Written(Struct, frozen=True):
     version: VersionVector
 
 
+class RecordAsk(Struct, frozen=True, omit_defaults=True):
+    """`record_read`: a record, from whoever holds it; the answer of `read`, tombstones left out."""
+
+    key: str
+    quorum: bool = False
+
+
+class RecordChange(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """`record_write`: compare and set, through any gateway."""
+
+    key: str
+    value: bytes = b""
+    deleted: bool = False
+    expected: VersionVector | None = None
+    quorum: bool = False
+    write: str = ""
+    """An id of the caller's own makes asking again safe; empty: one is made."""
+
+
 class Dht:
     """The replicated records as one gateway sees them."""
 
     def __init__(
-        self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership, pulse: Pulse
+        self,
+        config: PlaneConfig,
+        *,
+        gateway: str,
+        store: Store,
+        rpc: Rpc,
+        membership: Membership,
+        pulse: Pulse,
+        voting: Voting,
     ) -> None:
         self.resolver: Resolver | None = None
         self.on_ring_change: list[Callable[[], None]] = []
@@ -90,6 +118,9 @@ class Dht:
         self._rpc = rpc
         self._membership = membership
         self._pulse = pulse
+        self._voting = voting
+        voting.learn = self._learn
+        voting.resolver = lambda: self.resolver or by_bytes
         self._stalls = 0
         self._settled = Ring((), virtual_nodes=config.virtual_nodes)
         self._settling = asyncio.Condition()
@@ -97,16 +128,25 @@ class Dht:
         rpc.register("dht_read", KeyAsk, self._on_read, exchange=False)
         rpc.register("dht_write", Write, self._on_write, exchange=False)
         rpc.register("dht_store", StoreAsk, self._on_store, exchange=False)
+        rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
+        rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
 
     # --- the door ---------------------------------------------------------------------------------------------
 
-    async def read(self, key: str) -> Record | None:
+    async def read(self, key: str, *, quorum: bool = False) -> Record | None:
         """Return a record from its owner or, when that does not answer, the next replica; None: there is none.
 
+        `quorum`: as a majority of the key's voters has it, so that no write with a quorum that was acknowledged
+        before is missed (linearizable, `plane.quorum`).
+
         Raises:
-            UnreachableError: none of the replicas answered.
+            UnreachableError: none of the replicas answered; `quorum`: fewer than a majority of the voters.
+            ConfigError: `quorum`, and no voters are configured.
         """
         check_key(key)
+        if quorum:
+            chosen = await self._voting.read(key)
+            return None if chosen is None or chosen.deleted else chosen
         problem: SwiftbotError | None = None
         for gateway in await self._membership.holders(key, self._config.replicas):
             try:
@@ -122,25 +162,43 @@ class Dht:
         raise UnreachableError(f"no replica of {key} answers: {problem}", remedy="try again in a second")
 
     async def write(
-        self, key: str, value: bytes, *, expected: VersionVector | None, durable: bool = True
+        self,
+        key: str,
+        value: bytes,
+        *,
+        expected: VersionVector | None,
+        durable: bool = True,
+        quorum: bool = False,
     ) -> VersionVector:
         """Compare and set: `expected` is the version that was read, None when there must be no record.
 
+        `quorum`: ordered by a majority of the key's voters, so that two parts of a fleet that are cut off from each
+        other cannot both change it. All writers of a key must ask for it, or none: a plain write is not ordered with
+        those.
+
         Returns:
             The new version; by then the value is on the disk of the owner and of every reachable replica (not
-            `durable`: written, but the last moments may be lost with the power of all of them).
+            `durable`: written, but the last moments may be lost with the power of all of them; `quorum`: on the
+            disks of a majority of the voters, in any case).
 
         Raises:
             ConflictError: the record has moved on; read, decide again, retry.
-            UnreachableError: no owner could be reached within `write_timeout_s`; it may or may not be written.
+            UnreachableError: no owner, or no majority of the voters, could be reached within `write_timeout_s`; it
+                may or may not be written.
+            ConfigError: `quorum`, and no voters are configured.
             PayloadError: the value or key is too large.
         """
         asked = Write(key=key, value=value, expected=expected, write=uuid.uuid4().hex, durable=durable)
-        return await self._write(asked)
+        return await (self._voting.write(asked) if quorum else self._write(asked))
 
-    async def remove(self, key: str, *, expected: VersionVector) -> None:
+    async def remove(self, key: str, *, expected: VersionVector, quorum: bool = False) -> None:
         """Remove a record; errors as for `write`."""
-        await self._write(Write(key=key, deleted=True, expected=expected, write=uuid.uuid4().hex))
+        asked = Write(key=key, deleted=True, expected=expected, write=uuid.uuid4().hex)
+        await (self._voting.write(asked) if quorum else self._write(asked))
+
+    def voters(self, key: str) -> tuple[str, ...]:
+        """The gateways that vote on a key where a quorum is asked for; ConfigError when none are configured."""
+        return self._voting.voters(check_key(key))
 
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
@@ -235,6 +293,20 @@ class Dht:
             return None
         return answer.record
 
+    async def _learn(self, record: Record) -> None:
+        """A quorum has chosen a record: the ordinary copies follow, while the writer goes on."""
+        if len(self._pushes) >= _MOST_PUSHES:
+            await self._spread(record)
+        else:
+            self._later(self._spread(record))
+
+    async def _spread(self, record: Record) -> None:
+        with contextlib.suppress(SwiftbotError):  # nobody to hold a copy is reached: a later one comes with the next
+            holders = await self._membership.holders(record.key, self._config.replicas)
+            if self._gateway in holders:
+                await self.keep(record)
+            await asyncio.gather(*(self._push(each, record) for each in holders if each != self._gateway))
+
     def _later(self, push: Coroutine[Any, Any, None]) -> None:
         if len(self._pushes) >= _MOST_PUSHES:
             push.close()  # anti-entropy will find it
@@ -288,6 +360,20 @@ class Dht:
         resolver = self.resolver or by_bytes
         kept = await self._store.change(record.key, partial(_settle, record, resolver))
         return record if kept is None else kept
+
+    async def _on_record_read(self, asked: RecordAsk) -> Found:
+        return Found(await self.read(asked.key, quorum=asked.quorum))
+
+    async def _on_record_write(self, asked: RecordChange) -> Written:
+        write = Write(
+            key=asked.key,
+            value=asked.value,
+            deleted=asked.deleted,
+            expected=asked.expected,
+            write=asked.write or uuid.uuid4().hex,
+        )
+        check_write(write, max_bytes=self._config.max_record_bytes)
+        return Written(await (self._voting.write(write) if asked.quorum else self._write(write)))
 
     def _replicas(self, key: str) -> tuple[str, ...]:
         return self._membership.ring.successors(key, self._config.replicas)

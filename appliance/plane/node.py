@@ -16,6 +16,7 @@ from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
 from appliance.plane.pulse import Pulse
+from appliance.plane.quorum.voting import Voting
 from appliance.plane.reconcile import Reconciler
 from appliance.plane.registry import Registry
 from appliance.plane.ring import Ring
@@ -59,8 +60,15 @@ class Plane:
         self._membership = _membership(config, session, self.rpc, gateway)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
+        self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self.dht = Dht(
-            config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, pulse=self._pulse
+            config,
+            gateway=gateway,
+            store=store,
+            rpc=self.rpc,
+            membership=self._membership,
+            pulse=self._pulse,
+            voting=self._voting,
         )
         self._reconciler = Reconciler(
             config,
@@ -118,6 +126,7 @@ class Plane:
 
     async def _join(self) -> None:
         membership = self._membership
+        await self._voting.start(lost=self.store.set_aside is not None)
         if self.config.connect:
             await self._first_link()
         if await self._taken():

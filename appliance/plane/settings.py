@@ -5,7 +5,8 @@ from urllib.parse import urlsplit
 
 from msgspec import Struct
 
-from appliance.errors import ConfigError
+from appliance.errors import ConfigError, PayloadError
+from appliance.plane.keys import check_name
 
 _PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "serial"})
 
@@ -25,6 +26,9 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Copies of a record, the owner's among them: two gateways may die at once without losing one (design: r = 3)."""
     virtual_nodes: int = 32
     """Points of each gateway on the ring: shares within about 20 % of each other, and still cheap to compute."""
+    voters: tuple[str, ...] = ()
+    """Gateways that vote on reads and writes with a quorum, the same list everywhere; empty: nobody may ask for one.
+    Named and not learned: two parts of a fleet that do not see each other must agree on what a majority is."""
     view: Literal["full"] | int = "full"
     """`full`: every gateway knows every other, a lookup is one hop; right to about 1,000. A number: each knows so many
     (4·log2 N is plenty), looks up hop by hop and has one point on the ring; the same in the whole fleet. Records work
@@ -80,6 +84,13 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 f"plane.view is {self.view}",
                 remedy=f'"full", or at least {max(16, 4 * self.replicas)}: neighbours and fingers must fit in',
             )
+        for name in self.voters:
+            try:
+                check_name(name, "gateway")
+            except PayloadError as error:
+                raise ConfigError(f"plane.voters: {error}", remedy="name gateways by their ids") from error
+        if len(set(self.voters)) < len(self.voters):
+            raise ConfigError("plane.voters names a gateway twice", remedy="name each once")
         for name, least in _LEAST.items():
             if getattr(self, name) < least:
                 raise ConfigError(f"plane.{name} is {getattr(self, name)}", remedy=f"at least {least}")

@@ -89,6 +89,20 @@ class Store:
         """Keep a value; on the disk when this returns, unless not `durable`."""
         await self._execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", key, value, durable=durable)
 
+    async def alter(self, key: str, change: Callable[[bytes | None], bytes | None]) -> None:
+        """Read a value and put what `change` makes of it, with nothing in between; None: leave it.
+
+        `change` runs on the store's thread, and again if the commit it was part of fails.
+        """
+
+        def run(db: sqlite3.Connection) -> None:
+            row = db.execute("SELECT value FROM kept WHERE key = ?", (key,)).fetchone()
+            changed = change(row[0] if row else None)
+            if changed is not None:
+                db.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, changed))
+
+        await self._call(run, writes=True)
+
     async def delete(self, key: str) -> None:
         """Forget a key; no error when there is none."""
         await self._execute("DELETE FROM kept WHERE key = ?", key)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from appliance.plane import bounded, dht, reconcile, registry
 from appliance.plane.keys import Keys
+from appliance.plane.quorum import voting
 from appliance.plane.settings import PlaneConfig
 
 
@@ -27,10 +28,10 @@ def test_every_verb_of_the_plane_is_described(project_root: Path) -> None:
     text = (project_root / "docs" / "keyspace.md").read_text()
     verbs = {
         verb
-        for module in (bounded, dht, reconcile, registry)
+        for module in (bounded, dht, reconcile, registry, voting)
         for verb in re.findall(r'register\("(\w+)"', inspect.getsource(module))
     }
-    assert len(verbs) == 9
+    assert len(verbs) == 16
     assert all(f"| `{verb}` |" in text for verb in verbs)
 
 
