@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -156,7 +156,7 @@ async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> Fl
             ) from error
         await _wait_ready(state, order, progress, timeout_s)
     except BaseException:
-        await _end(starting.processes, grace_s=10.0)
+        await end(starting.processes, grace_s=10.0)
         if starting.processes:
             await remove_containers(order.fleet, progress=progress)
         raise
@@ -264,20 +264,25 @@ class _Starting:
         )
 
     def _spawn(self, name: str, *arguments: str) -> None:
-        path = self._order.directory / "logs" / f"{name}.log"
-        with path.open("ab") as log:
-            pid = os.posix_spawn(
-                sys.executable,
-                [sys.executable, "-m", "appliance.cli", *arguments],
-                os.environ,
-                file_actions=[
-                    (os.POSIX_SPAWN_OPEN, 0, "/dev/null", os.O_RDONLY, 0),
-                    (os.POSIX_SPAWN_DUP2, log.fileno(), 1),
-                    (os.POSIX_SPAWN_DUP2, log.fileno(), 2),
-                ],
-                setsid=True,
-            )
-        self.processes.append(Process(name=name, pid=pid, started=psutil.Process(pid).create_time(), log=str(path)))
+        log = self._order.directory / "logs" / f"{name}.log"
+        self.processes.append(spawn(name, (sys.executable, "-m", "appliance.cli", *arguments), log))
+
+
+def spawn(name: str, command: Sequence[str], log_file: Path) -> Process:
+    """Start a process in a session of its own, which writes to that file; FileNotFoundError when there is no such."""
+    with log_file.open("ab") as log:
+        pid = os.posix_spawnp(
+            command[0],
+            tuple(command),
+            os.environ,
+            file_actions=[
+                (os.POSIX_SPAWN_OPEN, 0, "/dev/null", os.O_RDONLY, 0),
+                (os.POSIX_SPAWN_DUP2, log.fileno(), 1),
+                (os.POSIX_SPAWN_DUP2, log.fileno(), 2),
+            ],
+            setsid=True,
+        )
+    return Process(name=name, pid=pid, started=psutil.Process(pid).create_time(), log=str(log_file))
 
 
 async def _wait_ready(state: FleetState, order: Order, progress: Progress, timeout_s: float) -> None:
@@ -363,7 +368,7 @@ async def down(directory: Path, *, progress: Progress, grace_s: float = 30.0) ->
     for group, what in ((robots, "robots"), (gateways, "gateways"), (rest, "recorder")):
         if group:
             progress(f"stopping {what}")
-            await _end(group, grace_s=grace_s)
+            await end(group, grace_s=grace_s)
     await remove_containers(state.fleet, progress=progress)
     (directory / "fleet.json").unlink(missing_ok=True)
     return state
@@ -382,7 +387,7 @@ async def remove_containers(fleet: str, *, progress: Progress) -> None:
         progress(f"removed {removed} containers")
 
 
-async def _end(processes: list[Process], *, grace_s: float) -> None:
+async def end(processes: list[Process], *, grace_s: float) -> None:
     """SIGTERM, wait, SIGKILL; only the very processes that were started."""
     for process in processes:
         _signal(process, signal.SIGTERM)

@@ -180,6 +180,45 @@ def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: in
     return 0 if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else 1
 
 
+@bench_app.command
+def chaos(
+    *,
+    minutes: float = 5.0,
+    tasks: int = 200,
+    gateways: int = 8,
+    every_s: float = 4.0,
+    down_at_once: int = 2,
+    freezes: float = 0.2,
+    seed: int = 1,
+    keep: str = "",
+    as_json: Json = False,
+) -> int:
+    """Tasks with counted effects on gateways that are killed, stopped and started again: is anything lost or doubled?
+
+    Ends with 1 when a task that was accepted did not end, or an effect is missing or there twice; then the folder
+    with the MCAP log and the ledger is kept and named.
+
+    Args:
+        minutes: How long gateways go down.
+        tasks: Tasks handed in over that time.
+        gateways: Gateways, each a process.
+        every_s: Mean time between outages, seconds.
+        down_at_once: Most that are down at the same time; up to 2, of 3 replicas one is always there.
+        freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
+        seed: Of tasks and outages.
+        keep: Folder to keep logs and ledger in.
+    """
+    from appliance.bench.chaos.run import Options, run
+
+    options = Options(
+        gateways=gateways, tasks=tasks, seconds=minutes * 60, every_s=every_s, down_at_once=down_at_once,
+        freezes=freezes, seed=seed, keep=keep,
+    )  # fmt: skip
+    result = measure(run(options, progress=say))
+    tell(result, as_json=as_json)
+    return 0 if result["held"] else 1
+
+
 @bench_app.command(name="table")
 def bench_table(file: Path, /) -> int:
     """Render what a benchmark printed with --json as Markdown tables.

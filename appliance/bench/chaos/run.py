@@ -1,0 +1,321 @@
+"""Runs tasks on a fleet whose gateways are killed, stopped and started again, and checks what became of them.
+
+At most r-1 gateways are down at once, which is what replication is made for: then nothing that was accepted may be
+lost. With `down_at_once` more can be told to be down; then too nothing may be lost in the end, since every gateway
+comes back with its disk, but tasks may stand still until one that holds their record is back.
+"""
+
+import asyncio
+import contextlib
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import AsyncGenerator, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from appliance.bench.chaos import account, plan
+from appliance.bench.chaos.account import Down, Follower, Submitted
+from appliance.bench.chaos.arena import Arena, Progress, Site, loopback
+from appliance.bench.chaos.ledger import LedgerFile, LedgerRobot
+from appliance.bench.pooled import fleet_name, write_skill
+from appliance.client import FleetClient
+from appliance.errors import NotFoundError, SwiftbotError
+from appliance.model import LogLine, TaskRecord, TaskRequest
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.settings import PoolConfig
+from appliance.tasks.machine import Transition
+
+ROBOTS = 4
+MANIFEST = """
+id = "bench_ledger"
+domain = "coordination"
+summary = "Make some effects, each a line in a ledger, to count them."
+runs = "robot"
+image = "base"
+cpu = 0.1
+memory_mb = 48
+timeout_s = 60
+retries = 3
+verbs = ["pick"]
+
+[params.name]
+type = "string"
+required = true
+
+[params.steps]
+type = "integer"
+required = true
+
+[params.pause_ms]
+type = "integer"
+required = true
+
+[params.save]
+type = "string"
+required = true
+"""
+HANDLER = """
+import time
+
+
+def run(ctx):
+    done = (ctx.resume or {}).get("done", 0)
+    begun = done
+    while done < ctx.params["steps"]:
+        ctx.command("pick", timeout_s=50, object=f"{ctx.params['name']}#{done}")
+        done += 1
+        if ctx.params["save"] == "each":
+            ctx.checkpoint({"done": done})
+        time.sleep(ctx.params["pause_ms"] / 1e3)
+    return {"begun": begun, "done": done, "attempt": ctx.attempt}
+"""
+
+
+class Options(Struct, frozen=True, kw_only=True):
+    """What a run is made of."""
+
+    gateways: int = 8
+    tasks: int = 200
+    seconds: float = 300.0
+    """How long gateways go down; tasks are handed in over the first 80 % of it."""
+    every_s: float = 4.0
+    """Mean time between outages."""
+    freezes: float = 0.2
+    """Share of outages in which the gateway is only stopped and goes on later."""
+    down_at_once: int = 2
+    """r - 1: more than that is not what replication promises to survive without waiting."""
+    settle_s: float = 120.0
+    """How long tasks may take to end once everybody is up again."""
+    containers: int = 1
+    """Kept ready by each gateway."""
+    seed: int = 1
+    keep: str = ""
+    """Folder for logs of the run; empty: a temporary one, kept only when an invariant is broken."""
+
+
+class Trial:
+    """One fleet with its ledger robots, and what is heard of it."""
+
+    def __init__(
+        self, options: Options, arena: Arena, client: FleetClient, observer: Session, file: LedgerFile
+    ) -> None:
+        self.options = options
+        self.arena = arena
+        self.client = client
+        self.file = file
+        self.follower = Follower()
+        self.submitted: dict[str, Submitted] = {}
+        # A peer without a token: linked to every gateway, so that it misses nothing when one of them dies.
+        session, keys = observer, observer.keys
+        session.subscribe_typed(keys.transition(), Transition, self._moved)
+        session.subscribe_typed(keys.task(), TaskRecord, self._told)
+        session.subscribe_typed(keys.log(), LogLine, self._logged)
+
+    def _moved(self, key: str, step: Transition | None) -> None:
+        del key
+        if step is not None:
+            self.follower.moved(step, time.monotonic_ns())
+
+    def _told(self, key: str, record: TaskRecord | None) -> None:
+        del key
+        if record is not None:
+            self.follower.told(record)
+
+    def _logged(self, key: str, line: LogLine | None) -> None:
+        if line is not None and line.event == "gateway lost":
+            self.follower.noticed(str(line.fields.get("member", "")), key.split("/")[-2], time.monotonic_ns())
+
+    async def submit(self, wanted: Sequence[plan.Wanted], began: float) -> None:
+        """Hand the tasks in when they are wanted."""
+        async with asyncio.TaskGroup() as group:
+            for each in wanted:
+                await asyncio.sleep(max(0.0, began + each.at_s - time.monotonic()))
+                group.create_task(self._submit(each))
+
+    async def _submit(self, each: plan.Wanted) -> None:
+        request = TaskRequest(instruction=f"chaos {each.task}", id=each.task, plan=each.plan)
+        try:
+            await self.client.submit(request)
+            self.submitted[each.task] = Submitted(task=each.task, accepted=True)
+        except SwiftbotError as error:
+            self.submitted[each.task] = Submitted(task=each.task, accepted=False, problem=error.code)
+
+    async def outages(self, planned: Sequence[plan.Outage], began: float, progress: Progress) -> None:
+        """Have gateways go down and come back as planned."""
+        async with asyncio.TaskGroup() as group:
+            for each in planned:
+                await asyncio.sleep(max(0.0, began + each.at_s - time.monotonic()))
+                group.create_task(self._outage(each, began, progress))
+
+    async def _outage(self, each: plan.Outage, began: float, progress: Progress) -> None:
+        if each.gateway not in self.arena.up():
+            progress(f"{each.gateway} is not up when it should go down: see its log")
+            return
+        down: Down = self.follower.down(each.gateway, each.kind, time.monotonic_ns(), time.time_ns())
+        if each.kind == "freeze":
+            self.arena.signal(each.gateway, signal.SIGSTOP)
+        else:
+            await self.arena.kill(each.gateway)
+        try:
+            await asyncio.sleep(max(0.0, began + each.until_s - time.monotonic()))
+        finally:
+            if each.kind == "freeze":
+                self.arena.signal(each.gateway, signal.SIGCONT)
+            else:
+                self.arena.start(each.gateway)
+            down.until_ns = time.monotonic_ns()
+
+    async def ended(self, wanted: Sequence[plan.Wanted], *, wait_s: float, progress: Progress) -> None:
+        """Wait until every task that was handed in has ended, at most so long."""
+        until = time.monotonic() + wait_s
+        told = -1
+        while time.monotonic() < until:
+            open_tasks = [each.task for each in wanted if each.task not in self.follower.ended]
+            if open_tasks and len(open_tasks) == told:
+                # A push may have been missed: the record decides.
+                for task in open_tasks:
+                    record = await self.record(task)
+                    problem = self.submitted[task].problem if task in self.submitted else "not handed in"
+                    if (record is not None and record.state.final) or (record is None and problem):
+                        self.follower.ended.add(task)
+            if not open_tasks:
+                return
+            if len(open_tasks) != told:
+                told = len(open_tasks)
+                progress(f"{told} tasks are under way")
+            await asyncio.sleep(1.0)
+
+    async def record(self, task: str) -> TaskRecord | None:
+        """Return a task's record as the fleet has it; None when it has none."""
+        for _ in range(20):
+            try:
+                return await self.client.task(task)
+            except NotFoundError:
+                return None
+            except SwiftbotError:
+                await asyncio.sleep(0.5)
+        return None
+
+
+@asynccontextmanager
+async def trial(
+    options: Options, *, progress: Progress, sites: dict[str, Site] | None = None, clients: Sequence[str] = ()
+) -> AsyncGenerator[Trial]:
+    """A fleet, its ledger robots and a client; all gone afterwards but for the folder named in `keep`.
+
+    Args:
+        options: what it is made of.
+        progress: told what happens.
+        sites: where the gateways run; by default on the loopback.
+        clients: endpoints that client and robots link to; by default all.
+    """
+    folder, skills = _folder(options.keep)
+    arena = Arena(
+        fleet=fleet_name(),
+        directory=folder,
+        sites=sites or loopback(options.gateways),
+        pool=PoolConfig(floor={"base": options.containers}, capacity=max(4, options.containers)),
+        skills=skills,
+    )
+    file = LedgerFile(folder / "ledger.jsonl")
+    async with contextlib.AsyncExitStack() as stack:
+        stack.callback(file.close)
+        stack.push_async_callback(arena.stop, progress=progress)
+        await arena.start_all(progress=progress, ready=options.containers)
+        connect = tuple(clients) or arena.endpoints
+        client = await stack.enter_async_context(await arena.client(connect))
+        config = PlaneConfig(mode="peer", connect=arena.endpoints)
+        observer = await Session.open(config, arena.fleet)
+        stack.push_async_callback(observer.close)
+        it = Trial(options, arena, client, observer, file)
+        for number in range(ROBOTS):
+            robot = await LedgerRobot.start(f"ledger_{number + 1}", file, fleet=arena.fleet, connect=connect)
+            stack.push_async_callback(robot.close)
+        yield it
+
+
+def _folder(told: str) -> tuple[Path, Path]:
+    """Make the run's folder, and that of its skill in it."""
+    folder = Path(told or tempfile.mkdtemp(prefix="swiftbot-chaos-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    skills = write_skill(folder, "base", skill=plan.SKILL, handler=HANDLER)
+    (skills / plan.SKILL / "skill.toml").write_text(MANIFEST)
+    return folder, skills
+
+
+def robots() -> tuple[str, ...]:
+    """Names of the ledger robots."""
+    return tuple(f"ledger_{number + 1}" for number in range(ROBOTS))
+
+
+async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
+    """Run the tasks while gateways are killed and stopped.
+
+    Returns:
+        `tasks` (`account.outcomes`), `effects` (`account.effects`), `downtime` (`account.downtime`), `takeovers` by
+        task, `held`: whether all invariants were; `kept`: the folder with the MCAP log, the ledger and the gateways'
+        logs when they were not, or when it was asked for.
+
+    Raises:
+        DeadlineError, PrerequisiteError: the fleet did not start.
+    """
+    wanted = plan.tasks(
+        options.tasks, seconds=options.seconds * 0.8, robots=robots(), prefix=f"c{options.seed}-", seed=options.seed
+    )
+    async with trial(options, progress=progress) as it:
+        planned = plan.outages(
+            it.arena.names,
+            seconds=options.seconds,
+            most=options.down_at_once,
+            every_s=options.every_s,
+            freezes=options.freezes,
+            seed=options.seed,
+        )
+        progress(f"{len(wanted)} tasks over {options.seconds * 0.8:.0f} s, {len(planned)} outages")
+        began = time.monotonic()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(it.submit(wanted, began))
+            group.create_task(it.outages(planned, began, progress))
+        result = await judge(it, wanted, progress=progress)
+        folder = it.arena.directory
+    result |= {"gateways": options.gateways, "seconds": options.seconds, "seed": options.seed}
+    return keep(result, folder, asked=bool(options.keep))
+
+
+async def judge(it: Trial, wanted: Sequence[plan.Wanted], *, progress: Progress) -> dict[str, Any]:
+    """Wait for the ends, then check the invariants."""
+    began = time.monotonic()
+    await it.ended(wanted, wait_s=it.options.settle_s, progress=progress)
+    settled_s = time.monotonic() - began
+    records = {each.task: await it.record(each.task) for each in wanted}
+    submitted = [it.submitted[each.task] for each in wanted]
+    tasks = account.outcomes(submitted, records)
+    effects = account.effects(wanted, records, it.file.read())
+    broken = [
+        *(f"{len(tasks[kind])} {kind}" for kind in ("missing", "open", "failed") if tasks[kind]),
+        *(f"{effects[kind]} effects {kind}" for kind in ("doubled", "lost", "early", "strange") if effects[kind]),
+    ]
+    return {
+        "held": not broken,
+        "broken": broken,
+        "tasks": tasks,
+        "effects": effects,
+        "downtime": account.downtime(it.follower.downs),
+        "takeovers": sum(it.follower.takeovers.values()),
+        "tasks_taken_over": len(it.follower.takeovers),
+        "settled_s": round(settled_s, 1),
+    }
+
+
+def keep(result: dict[str, Any], folder: Path, *, asked: bool) -> dict[str, Any]:
+    """Name the folder of the logs in the result when there is a reason to look at them, else remove it."""
+    if asked or not result["held"]:
+        return result | {"kept": str(folder), "log": [str(each) for each in sorted(folder.glob("record/*.mcap"))]}
+    shutil.rmtree(folder, ignore_errors=True)
+    return result
