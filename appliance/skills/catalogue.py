@@ -56,6 +56,14 @@ class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     description: str = ""
 
 
+class Alternative(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A skill that may take the place of one that was given up."""
+
+    skill: Word
+    params: dict[str, Annotated[str, Meta(max_length=200)]] = field(default_factory=dict[str, str])
+    """Its parameters: `$name` is the value of ours of that name, where it is given; other text stands for itself."""
+
+
 class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A skill as `skill.toml` describes it. The first half is what the planner sees, the second what a run needs."""
 
@@ -93,6 +101,18 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Further attempts after a failure that another attempt may cure."""
     verbs: tuple[Word, ...] = ()
     """Robot commands its handler sends; a robot that lacks one cannot be given this skill."""
+    prepares: tuple[Word, ...] = ()
+    """State it brings its robot into, which another robot could be brought into by doing the same: `position`."""
+    ties: tuple[Word, ...] = ()
+    """State it leaves its robot in that no other robot has: `load`. What follows stays with that robot."""
+    frees: tuple[Word, ...] = ()
+    """State that it ends."""
+    alternatives: tuple[Alternative, ...] = ()
+    """Skills that may take its place when it is given up, best first."""
+    silent_s: Annotated[float, Meta(ge=0, le=86400)] = 0.0
+    """Longest that its handler goes without a sign of life: a run that is silent for longer is stuck. 0: not said."""
+    speculate: bool = False
+    """Whether a run that takes much longer than others may be left for a new attempt elsewhere."""
 
     implemented: bool = False
     """Whether `handler.py` is there. Set by the loader, never in the file."""
@@ -184,6 +204,8 @@ def _load(extra: tuple[Path, ...]) -> Catalogue:
                     file, "image", f"there is no image {manifest.image!r} (known: {', '.join(sorted(images))})"
                 )
             skills[manifest.id] = manifest
+    for manifest in skills.values():
+        _check_alternatives(manifest, skills)
     ordered = sorted(skills.values(), key=lambda each: (DOMAINS.index(each.domain), each.id))
     return Catalogue(DOMAINS, {each.id: each for each in ordered}, images)
 
@@ -207,6 +229,8 @@ def _manifests(root: Path) -> Iterator[SkillManifest]:
                 raise _wrong(file, f"params.{param}", "a parameter's name is of a-z, 0-9 and '_'")
         if manifest.runs == "compute" and manifest.verbs:
             raise _wrong(file, "verbs", "a skill that runs on no robot sends no robot commands")
+        if manifest.speculate and (manifest.runs == "robot" or manifest.volumes):
+            raise _wrong(file, "speculate", "only for what runs on no robot and writes no volume: effects would double")
         _check_loads(file, manifest, folder)
         yield msgspec.structs.replace(manifest, implemented=(folder / "handler.py").is_file(), folder=folder)
 
@@ -223,6 +247,25 @@ def _check_loads(file: Path, manifest: SkillManifest, folder: Path) -> None:
             raise _wrong(file, "loads", f"{name!r}: the path is to be relative and without '..'")
         if not colon and not (folder / path).exists():
             raise _wrong(file, "loads", f"{folder / path} is not there")
+
+
+def _check_alternatives(manifest: SkillManifest, skills: dict[str, SkillManifest]) -> None:
+    file = manifest.folder / "skill.toml"
+    for each in manifest.alternatives:
+        other = skills.get(each.skill)
+        if other is None or other.id == manifest.id:
+            raise _wrong(file, "alternatives", f"{each.skill!r} is no other skill")
+        for name, source in each.params.items():
+            ours, theirs = manifest.params.get(source[1:]), other.params.get(name)
+            if theirs is None:
+                raise _wrong(file, "alternatives", f"{other.id} has no parameter {name!r}")
+            if source.startswith("$") and (ours is None or ours.type != theirs.type):
+                raise _wrong(file, "alternatives", f"{source!r} is no parameter of {manifest.id} of type {theirs.type}")
+            if not source.startswith("$") and theirs.type != "string":
+                raise _wrong(file, "alternatives", f"{name} of {other.id} is a {theirs.type}: only text can be given")
+        for name, param in other.params.items():
+            if param.required and name not in each.params:
+                raise _wrong(file, "alternatives", f"{other.id} needs {name}: map it in `params`")
 
 
 def _images(root: Path) -> Iterator[ImageSpec]:

@@ -1,0 +1,79 @@
+"""What to do about a subtask that was given up, cheapest first: another robot, another skill, a new plan, or nothing.
+
+Pure: facts in, one decision out, with the reasons why nothing simpler would do, in words for people.
+"""
+
+from collections.abc import Mapping
+
+from msgspec import Struct
+
+from appliance.model import SubtaskRecord, TaskRecord
+from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.replan.robots import Rebinding, Robots, another_robot, is_the_robots, robot_of
+from appliance.tasks.replan.settings import ReplanConfig
+from appliance.tasks.replan.skills import Substitution, alternative_skill
+
+
+class AskDecomposer(Struct, frozen=True, kw_only=True):
+    """Nothing simpler helps: the decomposer is to plan anew what is left."""
+
+    note: str
+
+
+class GiveUp(Struct, frozen=True, kw_only=True):
+    """Nothing can be done; why, in words."""
+
+    note: str
+
+
+Decision = Rebinding | Substitution | AskDecomposer | GiveUp
+
+
+def worth_replanning(record: TaskRecord, failure_code: str, config: ReplanConfig) -> bool:
+    """Whether a subtask that is given up is looked at at all: not when somebody stopped it or enough was revised."""
+    return failure_code != "cancelled" and record.revised < config.max_revisions
+
+
+def decide(
+    record: TaskRecord,
+    target: SubtaskRecord,
+    *,
+    manifests: Mapping[str, SkillManifest],
+    robots: Robots,
+    config: ReplanConfig,
+) -> Decision:
+    """Decide what is done about a subtask that was given up.
+
+    Args:
+        record: the task, in which the subtask stands as failed.
+        target: the subtask.
+        manifests: those that are known here, by skill.
+        robots: the roster.
+        config: what the operator allows.
+    """
+    if record.revised >= config.max_revisions:
+        return GiveUp(note=f"the plan was revised {record.revised} times already (tasks.replan.max_revisions)")
+    reasons: list[str] = []
+    if target.subtask.robot is not None:
+        robot = robot_of(target)
+        why = is_the_robots(target.failure, robots.roster.get(robot)) if target.failure and robot else ""
+        if why:
+            rebinding = another_robot(record, target, why, manifests=manifests, robots=robots, config=config)
+            if isinstance(rebinding, Rebinding):
+                return rebinding
+            reasons.append(rebinding)
+    substitution = (
+        alternative_skill(record, target, manifests=manifests) if config.skills else "tasks.replan.skills is off"
+    )
+    if isinstance(substitution, Substitution):
+        return substitution
+    reasons.append(substitution)
+    if record.handed_in:
+        reasons.append("its plan was handed in with the task and is not planned anew")
+    elif not config.decompose:
+        reasons.append("tasks.replan.decompose is off")
+    elif record.replans >= config.max_replans:
+        reasons.append(f"it was planned anew {record.replans} times already (tasks.replan.max_replans)")
+    else:
+        return AskDecomposer(note="; ".join(reasons))
+    return GiveUp(note="; ".join(reasons))
