@@ -18,7 +18,7 @@ from appliance.plane.membership import Membership
 from appliance.plane.overlay.lookup import Lookup, NextAsk, Owners
 from appliance.plane.overlay.upkeep import LeaveAsk, Meet, MeetAsk, Seek, Upkeep
 from appliance.plane.overlay.view import Around, Step, View
-from appliance.plane.ring import RING_BITS, RING_SIZE, Ring, position
+from appliance.plane.ring import RING_BITS, RING_SIZE, position
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
 
@@ -198,7 +198,6 @@ class BoundedMembership(Membership):
         if known == before:
             return
         self._members = known | {self._me}
-        self.ring = Ring(self._members, virtual_nodes=1)
         for name in sorted(known - before):
             self._tell(self.on_joined, name)
         for name in sorted(before - known):

@@ -28,9 +28,8 @@ class Membership:
     def __init__(self, session: Session, *, gateway: str | None, virtual_nodes: int) -> None:
         self._session = session
         self._gateway = gateway
-        self._virtual_nodes = virtual_nodes
         self._members: frozenset[str] = frozenset() if gateway is None else frozenset({gateway})
-        self.ring = Ring(self._members, virtual_nodes=virtual_nodes)
+        self._ring = Ring(self._members, virtual_nodes=virtual_nodes)
         self.on_joined: list[Callable[[str], None]] = []
         self.on_lost: list[Callable[[str], None]] = []
         self._tokens: dict[str, set[str]] = {}
@@ -44,6 +43,14 @@ class Membership:
     def members(self) -> frozenset[str]:
         """Ids of the gateways that are there; this one counts itself in."""
         return self._members
+
+    @property
+    def ring(self) -> Ring:
+        """The ring of the members; made when it is asked for, so that a burst of news makes it once."""
+        if self._ring.members is not self._members:
+            self._ring = self._ring.changed_to(self._members)
+            self._members = self._ring.members
+        return self._ring
 
     def sees(self, name: str) -> bool:
         """Whether a gateway counts as there for its questions about records."""
@@ -102,7 +109,6 @@ class Membership:
         if alive:
             self._tokens[name] = {key}
         self._members = self._members | {name} if alive else self._members - {name}
-        self.ring = Ring(self._members, virtual_nodes=self._virtual_nodes)
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
         self._tell(self.on_joined if alive else self.on_lost, name)
 

@@ -18,6 +18,7 @@ from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.plane.dht import Dht, Found, StoreAsk
 from appliance.plane.keys import check_name
 from appliance.plane.membership import Membership
+from appliance.plane.partners import partners, sharing
 from appliance.plane.pulse import Pulse
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
@@ -42,6 +43,8 @@ _TRIES = 3
 """Comparisons with a new ring before this gateway goes on without a member that is seen but does not answer."""
 _LOST_S = 600.0
 """How long a member that was lost is asked whether it is there after all."""
+_AT_REST = 8
+"""Members compared with in a round while nothing changes: all of a small fleet, some of a large one in turn."""
 _BREATH = 500
 """Keys looked at before the loop gets a turn."""
 
@@ -102,6 +105,7 @@ class Reconciler:
         self._pulse = pulse
         self._changed = asyncio.Event()
         self._seen = asyncio.Condition()
+        self._turn = 0
         self._running: asyncio.Task[None] | None = None
         self._waking: set[asyncio.Task[None]] = set()
         rpc.register("dht_digest", DigestAsk, self._on_digest, exchange=False)
@@ -138,7 +142,7 @@ class Reconciler:
             self._changed.clear()
             now = ring, stalls = self._membership.ring, self._pulse.stalls
             try:
-                heard, handed, fetched = await self._round(ring)
+                heard, handed, fetched = await self._round(ring, self._to_compare(settled, ring, stalls))
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
                 heard, handed, fetched = False, False, 0
@@ -184,13 +188,31 @@ class Reconciler:
             except Exception:  # supervision boundary: one listener's defect must not stop the repair
                 log.exception("a listener to the ring failed")
 
-    async def _round(self, ring: Ring) -> tuple[bool, bool, int]:
-        """Compare with every other member.
+    def _to_compare(self, settled: tuple[Ring, int] | None, ring: Ring, stalls: int) -> list[str]:
+        """With whom: those whom a change of the ring concerns; all that share records after a stall or at first.
+
+        At rest some at a time, in turn: half of those that share records, half of all, since two that lost sight of
+        each other learn of it by asking.
+        """
+        replicas = self._config.replicas
+        if settled is None or settled[1] != stalls:
+            return sorted(sharing(ring, self._gateway, replicas))
+        if settled[0] != ring:
+            return sorted(partners(settled[0], ring, self._gateway, replicas))
+        others = sorted(ring.members - {self._gateway})
+        if len(others) <= _AT_REST:
+            return others
+        self._turn += 1
+        near = sorted(sharing(ring, self._gateway, replicas))
+        return sorted({*_some(near, self._turn), *_some(others, self._turn)})
+
+    async def _round(self, ring: Ring, members: list[str]) -> tuple[bool, bool, int]:
+        """Compare with these members.
 
         Returns:
             Whether all could be asked, whether all that belongs elsewhere was taken, how many records came in.
         """
-        results = await asyncio.gather(*(self._pull(each, ring) for each in sorted(ring.members - {self._gateway})))
+        results = await asyncio.gather(*(self._pull(each, ring) for each in members))
         handed = await self._hand_over(ring)
         before_ns = time.time_ns() - int(self._config.tombstone_hours * 3.6e12)
         await self._store.forget_tombstones(before_ns)
@@ -200,7 +222,8 @@ class Reconciler:
     async def join(self) -> None:
         """Fetch what this gateway will own before it shows itself, so that its first requests wait less."""
         ring = self._membership.ring
-        await asyncio.gather(*(self._pull(each, ring, joining=True) for each in sorted(ring.members - {self._gateway})))
+        near = sorted(sharing(ring, self._gateway, self._config.replicas))
+        await asyncio.gather(*(self._pull(each, ring, joining=True) for each in near))
 
     # --- fetching ---------------------------------------------------------------------------------------------
 
@@ -329,3 +352,10 @@ class Reconciler:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _some(names: list[str], turn: int) -> list[str]:
+    """Half of `_AT_REST` names, others each turn until all have had theirs."""
+    most = _AT_REST // 2
+    start = turn * most % max(1, len(names))
+    return (names[start:] + names[:start])[:most]

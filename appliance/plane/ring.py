@@ -13,6 +13,8 @@ from appliance.errors import UnreachableError
 
 RING_BITS = 160
 RING_SIZE = 2**RING_BITS
+_FEW = 8
+"""Members that come or go at once; beyond so many a ring made anew is as cheap as one changed."""
 
 
 def position(text: str) -> int:
@@ -37,6 +39,34 @@ class Ring:
         """Positions of all virtual nodes, ascending."""
         self.names: tuple[str, ...] = tuple(name for _, name in points)
         """Whose they are, in the same order."""
+
+    @classmethod
+    def _made(cls, members: frozenset[str], virtual_nodes: int, points: list[int], names: list[str]) -> "Ring":
+        ring = cls((), virtual_nodes=virtual_nodes)
+        ring.members, ring.points, ring.names = members, tuple(points), tuple(names)
+        return ring
+
+    def changed_to(self, members: frozenset[str]) -> "Ring":
+        """The ring of other members; one that differs in a few is made from this one, which is cheaper."""
+        if members == self.members:
+            return self
+        came, went = members - self.members, self.members - members
+        if len(came) + len(went) > _FEW:
+            return Ring(members, virtual_nodes=self.virtual_nodes)
+        points, names = list(self.points), list(self.names)
+        for name in went:
+            for number in range(self.virtual_nodes):
+                at = names.index(name, bisect_left(points, point(name, number)))
+                del points[at], names[at]
+        for name in came:
+            for number in range(self.virtual_nodes):
+                place = point(name, number)
+                at = bisect_left(points, place)
+                while at < len(points) and points[at] == place and names[at] < name:
+                    at += 1
+                points.insert(at, place)
+                names.insert(at, name)
+        return Ring._made(members, self.virtual_nodes, points, names)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Ring) and self.members == other.members and self.virtual_nodes == other.virtual_nodes
@@ -72,8 +102,8 @@ class Ring:
 
     def with_member(self, name: str) -> "Ring":
         """The ring once that gateway has joined."""
-        return self if name in self.members else Ring(self.members | {name}, virtual_nodes=self.virtual_nodes)
+        return self.changed_to(self.members | {name})
 
     def without_member(self, name: str) -> "Ring":
         """The ring once that gateway has left."""
-        return Ring(self.members - {name}, virtual_nodes=self.virtual_nodes) if name in self.members else self
+        return self.changed_to(self.members - {name})

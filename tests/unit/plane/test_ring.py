@@ -86,3 +86,11 @@ def test_an_empty_ring_says_so() -> None:
     """Asking a ring without gateways is an error with a remedy."""
     with pytest.raises(UnreachableError, match="no gateway"):
         Ring([], virtual_nodes=8).owner("key")
+
+
+@given(members, members, st.integers(1, 8))
+def test_a_changed_ring_is_the_same_as_one_made_anew(before: set[str], after: set[str], points: int) -> None:
+    """However many come and go, the points and whose they are do not depend on what the ring was made from."""
+    changed = Ring(before, virtual_nodes=points).changed_to(frozenset(after))
+    made = Ring(after, virtual_nodes=points)
+    assert (changed.members, changed.points, changed.names) == (made.members, made.points, made.names)
