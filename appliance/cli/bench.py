@@ -219,6 +219,49 @@ def chaos(
     return 0 if result["held"] else 1
 
 
+@bench_app.command
+def history(
+    *,
+    seconds: float = 60.0,
+    gateways: int = 5,
+    clients: int = 8,
+    keys: int = 6,
+    quorum: bool = True,
+    every_s: float = 3.0,
+    freezes: float = 0.4,
+    down_at_once: int = 2,
+    seed: int = 1,
+    keep: str = "",
+    as_json: Json = False,
+) -> int:
+    """Concurrent compare-and-sets on records while gateways are killed and stopped: was every answer right?
+
+    With a quorum the history of each key is checked for linearizability; without one, that replicas agree in the end
+    and that no acknowledged write is forgotten. Ends with 1 when it is not so; the recorded history is kept and named.
+
+    Args:
+        seconds: How long.
+        gateways: Gateways, each a process with nothing but its plane.
+        clients: Clients, each linked to one gateway.
+        keys: Keys they share.
+        quorum: Ask for a quorum.
+        every_s: Mean time between outages, seconds.
+        freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
+        down_at_once: Most that are down at the same time.
+        seed: Of clients and outages.
+        keep: Folder to keep the gateways' data and logs in.
+    """
+    from appliance.bench.history.run import Options, run
+
+    options = Options(
+        seconds=seconds, gateways=gateways, clients=clients, keys=keys, quorum=quorum, every_s=every_s,
+        freezes=freezes, down_at_once=down_at_once, seed=seed, keep=keep,
+    )  # fmt: skip
+    result = measure(run(options, progress=say))
+    tell(result, as_json=as_json)
+    return 0 if result["held"] else 1
+
+
 @bench_app.command(name="table")
 def bench_table(file: Path, /) -> int:
     """Render what a benchmark printed with --json as Markdown tables.

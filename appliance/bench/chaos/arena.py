@@ -22,7 +22,7 @@ from appliance.pool.settings import PoolConfig
 from appliance.record.settings import RecordConfig
 
 Progress = Callable[[str], None]
-START_S = 90.0
+START_S = 180.0
 STOP_S = 20.0
 
 
@@ -43,6 +43,7 @@ class Arena:
         pool: of every gateway.
         skills: folder of the run's own skills.
         base: further settings of every gateway.
+        command: what runs a gateway, with the path of its configuration behind.
     """
 
     def __init__(
@@ -52,8 +53,9 @@ class Arena:
         directory: Path,
         sites: Mapping[str, Site],
         pool: PoolConfig,
-        skills: Path,
+        skills: Path | None = None,
         base: GatewayConfig | None = None,
+        command: Sequence[str] = (sys.executable, "-m", "appliance.cli", "gateway", "--config"),
     ) -> None:
         self.fleet = fleet
         self.directory = directory
@@ -63,6 +65,7 @@ class Arena:
         self._recorder: Process | None = None
         self._pool = pool
         self._skills = skills
+        self._gateway_command = tuple(command)
         self._base = base or GatewayConfig(id="gw-1", llm=LlmConfig(tiers=("rules",)))
 
     @property
@@ -88,7 +91,7 @@ class Arena:
                 id=name,
                 fleet=self.fleet,
                 data_dir=str(self.directory / name / "data"),
-                skills=(str(self._skills),),
+                skills=(str(self._skills),) if self._skills else (),
                 plane=replace(
                     self._base.plane,
                     listen=(site.endpoint,),
@@ -104,19 +107,16 @@ class Arena:
     def _config(self, name: str) -> Path:
         return self.directory / name / "gateway.toml"
 
-    def _command(self, *arguments: str) -> tuple[str, ...]:
-        return (sys.executable, "-m", "appliance.cli", *arguments)
-
     def start(self, name: str) -> Process:
         """Start a gateway."""
-        command = (*self.sites[name].enter, *self._command("gateway", "--config", str(self._config(name))))
+        command = (*self.sites[name].enter, *self._gateway_command, str(self._config(name)))
         process = local_fleet.spawn(name, command, self.directory / "logs" / f"{name}.log")
         self.processes[name] = process
         return process
 
     def record(self) -> None:
         """Start the recorder."""
-        command = self._command("record", "--config", str(self._config(self.names[0])))
+        command = (sys.executable, "-m", "appliance.cli", "record", "--config", str(self._config(self.names[0])))
         self._recorder = local_fleet.spawn("recorder", command, self.directory / "logs" / "recorder.log")
 
     def signal(self, name: str, number: signal.Signals) -> None:
@@ -132,7 +132,7 @@ class Arena:
         """Start every gateway and wait until each has so many containers ready.
 
         Raises:
-            DeadlineError: they were not within 90 s; the message says who.
+            DeadlineError: they were not within 180 s; the message says who.
         """
         self.prepare()
         for name in self.names:
@@ -180,7 +180,8 @@ class Arena:
         await local_fleet.end([self.processes[name] for name in self.up()], grace_s=STOP_S)
         if self._recorder is not None:
             await local_fleet.end([self._recorder], grace_s=STOP_S)
-        await local_fleet.remove_containers(self.fleet, progress=progress)
+        if self._skills is not None:
+            await local_fleet.remove_containers(self.fleet, progress=progress)
 
 
 def loopback(count: int) -> dict[str, Site]:

@@ -1,6 +1,6 @@
 """What a chaos run does: the same for the same seed, and never more gateways down than allowed."""
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.bench.chaos.plan import outages, tasks
@@ -8,6 +8,7 @@ from appliance.bench.chaos.plan import outages, tasks
 NAMES = [f"gw-{number}" for number in range(1, 9)]
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 10_000), most=st.integers(1, 4), every_s=st.floats(0.2, 10.0))
 def test_outages_keep_their_bound(seed: int, most: int, every_s: float) -> None:
     """At no time are more gateways down than allowed, and no gateway goes down twice at once."""
@@ -20,6 +21,7 @@ def test_outages_keep_their_bound(seed: int, most: int, every_s: float) -> None:
         assert each.at_s < each.until_s <= each.at_s + 8.0
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_tasks_are_plans_with_named_effects(seed: int) -> None:
     """Subtasks come only after earlier ones, and every effect has a name of its own."""
