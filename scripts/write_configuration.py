@@ -26,6 +26,8 @@ SECTIONS = (
     ("robots.mavlink", "appliance.robots.settings", "MavlinkLink"),
     ("record", "appliance.record.settings", "RecordConfig"),
     ("tasks", "appliance.tasks.settings", "TasksConfig"),
+    ("tasks.detection", "appliance.tasks.detection", "DetectionConfig"),
+    ("tasks.replan", "appliance.tasks.replan.settings", "ReplanConfig"),
 )
 HEAD = """# Configuration
 

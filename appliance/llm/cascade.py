@@ -12,7 +12,7 @@ stores so far; a cache of plans that were never carried out would repeat mistake
 import asyncio
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import structlog
@@ -21,9 +21,10 @@ from msgspec import Struct
 from appliance.errors import DeadlineError, PlanError, SwiftbotError
 from appliance.llm.rules.tier import RulesTier
 from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome, TierAttempt
+from appliance.llm.so_far import so_far
 from appliance.llm.tier import Planner, Proposal
 from appliance.llm.validate import MAX_PROBLEMS, validate
-from appliance.model import Plan, Tier
+from appliance.model import Plan, TaskRecord, Tier
 from appliance.skills.catalogue import Catalogue
 
 log = structlog.get_logger(__name__)
@@ -91,6 +92,45 @@ class Decomposer:
         Raises:
             PlanError: no tier gave a valid plan that was sure enough; `problems` says what each lacked.
         """
+        return await self._cascade(context, lambda plan: self._check(plan, context))
+
+    async def replan(
+        self,
+        record: TaskRecord,
+        context: PlanContext,
+        *,
+        problems: Callable[[Plan], Sequence[str]],
+        rest: Callable[[Plan], Plan],
+    ) -> PlanOutcome:
+        """Plan anew what is left of a task in which something failed.
+
+        The tiers are told what is done, running, failed and open, and answer with a whole plan; it passes the same
+        validator as any, as far as it is not begun yet, and `problems` besides.
+
+        Args:
+            record: the task as it stands.
+            context: the instruction, the roster and the site of now.
+            problems: what is wrong with a plan as the continuation of the task.
+            rest: what of a plan is still to be begun; PlanError when there is nothing.
+
+        Raises:
+            PlanError: no tier gave a valid plan that was sure enough; `problems` says what each lacked.
+        """
+        context = msgspec.structs.replace(context, so_far=so_far(record))
+
+        def check(plan: Plan) -> tuple[str, ...]:
+            # Its form first: what cannot be a plan cannot be fitted to the record either.
+            wrong = validate(plan, self._catalogue)
+            if wrong:
+                return wrong
+            try:
+                return (*problems(plan), *self._check(rest(plan), context))
+            except PlanError as error:
+                return (error.message, *error.problems)
+
+        return await self._cascade(context, check)
+
+    async def _cascade(self, context: PlanContext, check: Callable[[Plan], tuple[str, ...]]) -> PlanOutcome:
         attempts: list[TierAttempt] = []
         best: tuple[Plan, int] | None = None
         words = len(context.instruction.split())
@@ -98,7 +138,7 @@ class Decomposer:
             if skipped := _skip(slot, context, words):
                 attempts.append(TierAttempt(tier=slot.planner.name.value, ok=False, problems=(skipped,)))
                 continue
-            proposal, attempt = await self._ask(slot, context)
+            proposal, attempt = await self._ask(slot, context, check)
             attempts.append(attempt)
             if attempt.ok and proposal is not None:
                 return PlanOutcome(plan=_stamped(proposal, attempt), attempts=tuple(attempts))
@@ -113,7 +153,9 @@ class Decomposer:
             return PlanOutcome(plan=plan, attempts=tuple(attempts))
         raise _refusal(attempts)
 
-    async def _ask(self, slot: Slot, context: PlanContext) -> tuple[Proposal | None, TierAttempt]:
+    async def _ask(
+        self, slot: Slot, context: PlanContext, check: Callable[[Plan], tuple[str, ...]]
+    ) -> tuple[Proposal | None, TierAttempt]:
         """Ask one tier, with one repair; a proposal that is returned is valid."""
         tier = slot.planner.name.value
         self.asked[tier] = self.asked.get(tier, 0) + 1
@@ -128,11 +170,11 @@ class Decomposer:
         try:
             async with _deadline(slot.deadline_s, tier):
                 proposal = await slot.planner.propose(context)
-                problems = self._check(proposal, context)
+                problems = check(proposal.plan)
                 if problems and slot.planner.repairs and self._config.repair:
                     log.info("plan is repaired", tier=tier, problems=problems)
                     proposal = await slot.planner.propose(context, previous=proposal.plan, problems=problems)
-                    problems = self._check(proposal, context)
+                    problems = check(proposal.plan)
         except PlanError as error:
             return None, attempt(ok=False, confidence=0.0, problems=(error.message, *error.problems))
         except SwiftbotError as error:
@@ -149,9 +191,9 @@ class Decomposer:
             return proposal, attempt(ok=False, confidence=confidence, problems=(why, *proposal.problems))
         return proposal, attempt(ok=True, confidence=confidence, problems=proposal.problems)
 
-    def _check(self, proposal: Proposal, context: PlanContext) -> tuple[str, ...]:
+    def _check(self, plan: Plan, context: PlanContext) -> tuple[str, ...]:
         return validate(
-            proposal.plan,
+            plan,
             self._catalogue,
             robots=context.robots,
             site=context.site,

@@ -10,6 +10,7 @@ from functools import lru_cache
 import msgspec
 
 from appliance.llm.settings import PlanContext
+from appliance.llm.so_far import SoFar
 from appliance.model import Plan
 from appliance.skills.catalogue import Catalogue, SkillManifest
 
@@ -67,6 +68,14 @@ EXAMPLES: tuple[tuple[str, str, str], ...] = (
 """Roster, instruction and plan; what they show: parallel robots, a delivery, a group, a computation that gathers."""
 
 
+AGAIN = """\
+An earlier plan for this instruction was begun and something failed. Answer with a whole new plan: first what is done
+and what is running, each copied exactly, then what is to be done instead of the rest. Never repeat what failed with
+the same robot and parameters: use another skill, another robot, or leave it out if the instruction is met without it.
+A thing that a robot holds can only be put down or given by that robot."""
+"""What a model is told with an earlier plan. It copies what is done, so that the order of the rest can refer to it."""
+
+
 def messages(
     context: PlanContext, catalogue: Catalogue, *, previous: Plan | None = None, problems: tuple[str, ...] = ()
 ) -> list[dict[str, str]]:
@@ -104,7 +113,20 @@ def _asked(context: PlanContext) -> str:
     if context.site is not None and context.site.places:
         lines.append(f"Places: {', '.join(list(context.site.places)[:MAX_NAMES])}")
     lines.append(f"Instruction: {' '.join(context.instruction.split())}")
+    if context.so_far is not None:
+        lines += _so_far(context.so_far)
     return "\n".join(lines)
+
+
+def _so_far(so_far: SoFar) -> list[str]:
+    """What has become of the earlier plan, and what is asked for now."""
+    lines = [AGAIN]
+    for state, title in (("done", "Done"), ("running", "Running"), ("failed", "Failed"), ("open", "Not begun")):
+        for each in so_far.of(state):
+            subtask = {"id": each.id, "skill": each.skill, "robot": each.robot, "params": each.params}
+            text = msgspec.json.encode({**subtask, "after": list(each.after)}).decode()
+            lines.append(f"{title}: {text}{f' because: {each.reason}' if each.reason and state == 'failed' else ''}")
+    return lines
 
 
 def _system(catalogue: Catalogue) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from appliance.errors import ConfigError
+from appliance.llm.so_far import SoFar
 from appliance.model import Plan, RobotInfo, Site
 
 KNOWN_TIERS = ("local", "upstream", "rules")
@@ -96,6 +97,8 @@ class PlanContext(Struct, frozen=True, kw_only=True):
     robots: tuple[RobotInfo, ...] | None = None
     """The roster; None when it is unknown, which an empty one is not."""
     site: Site | None = None
+    so_far: SoFar | None = None
+    """What has become of an earlier plan for it; with it the rest is to be planned anew."""
     private: bool = False
     """The text must not leave this machine: the upstream tier is not asked."""
 

@@ -16,6 +16,14 @@ class TaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     id: str
 
 
+class AgreeAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`agree`, `agree_here`: an operator's word on the plan that is proposed for a task after a failure."""
+
+    id: str
+    agree: bool = True
+    by: str = ""
+
+
 class TasksAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """`tasks`: how many at most, newest first. `local` asks for the records of the answering gateway's shard alone."""
 
@@ -61,6 +69,8 @@ class RunStatus(Struct, frozen=True, kw_only=True):
 
     running: bool
     last: RunEvent | None = None
+    silent_s: float | None = None
+    """Seconds since the run's last sign of life, by that gateway's own clock; None when it does not run there."""
 
 
 class ContainerList(Struct, frozen=True, kw_only=True):

@@ -11,6 +11,7 @@ from appliance.tasks.api import RunStatus
 from appliance.tasks.bounds import MAX_RUN_S
 from appliance.tasks.hearing import Hearing
 from appliance.tasks.keeper import Keeper
+from appliance.tasks.monitor import Monitor
 from appliance.tasks.orders import Orders
 from appliance.tasks.surroundings import Surroundings, deadline_s
 
@@ -18,11 +19,14 @@ from appliance.tasks.surroundings import Surroundings, deadline_s
 class Checking:
     """Asks after the runs of one task now and then."""
 
-    def __init__(self, around: Surroundings, keeper: Keeper, orders: Orders, hearing: Hearing) -> None:
+    def __init__(
+        self, around: Surroundings, keeper: Keeper, orders: Orders, hearing: Hearing, monitor: Monitor
+    ) -> None:
         self._around = around
         self._keeper = keeper
         self._orders = orders
         self._hearing = hearing
+        self._monitor = monitor
         self.next_at = time.monotonic() + around.config.check_s
 
     async def check(self) -> None:
@@ -52,6 +56,8 @@ class Checking:
         answers = await asyncio.gather(*(self._orders.ask(each, task, "run_status") for each in targets))
         for target, status in zip(targets, answers, strict=True):
             self._learn(target, status)
+        for target, status in zip(targets, answers, strict=True):
+            self._judge(target, status)
 
     def _learn(self, target: SubtaskRecord, status: RunStatus | None) -> None:
         lost = ""
@@ -71,6 +77,12 @@ class Checking:
         if lost:
             failure = Failure(code="unreachable", message=lost, retryable=True)
             self._hearing.attempt_failed(target, failure, None)
+
+    def _judge(self, target: SubtaskRecord, status: RunStatus | None) -> None:
+        """Have a run looked at as it stands now that its gateway was asked."""
+        current = next((each for each in machine.active(self._keeper.record) if each.subtask == target.subtask), None)
+        if current is not None and current.attempt == target.attempt:
+            self._monitor.look(current, status.silent_s if status is not None and status.running else None)
 
     def _limit_s(self, target: SubtaskRecord) -> float:
         """How long a run may take; for a skill that only its gateway knows, as long as any."""

@@ -14,18 +14,28 @@ from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders, request_for
 from appliance.tasks.pace import Pace
+from appliance.tasks.replanning import Replanning
 from appliance.tasks.surroundings import MoveReady, Surroundings, figures
 
 
 class Dispatching:
     """Dispatches one task's subtasks; on the way to its end, cancels what still runs."""
 
-    def __init__(self, around: Surroundings, keeper: Keeper, orders: Orders, hearing: Hearing, pace: Pace) -> None:
+    def __init__(
+        self,
+        around: Surroundings,
+        keeper: Keeper,
+        orders: Orders,
+        hearing: Hearing,
+        pace: Pace,
+        replanning: Replanning,
+    ) -> None:
         self._around = around
         self._keeper = keeper
         self._orders = orders
         self._hearing = hearing
         self._pace = pace
+        self._replanning = replanning
         self._cancelled_at: float | None = None
         self._cancel_at: dict[str, float] = {}
 
@@ -54,6 +64,7 @@ class Dispatching:
                     attempt=target.next_attempt,
                     failure=failure,
                     give_up=True,
+                    replan=True,
                 )
             )
             return
@@ -61,7 +72,9 @@ class Dispatching:
         if subtask.robot is not None:
             robot, reason = self._around.bind(keeper.record, target)
             if robot is None:
-                self._wait(target, reason, now)
+                reason = self._replanning.robot_missing(target, reason, now)
+                if reason:
+                    self._wait(target, reason, now)
                 return
         placement = self._around.place(keeper.record, target, robot)
         if not placement.order:

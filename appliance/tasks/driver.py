@@ -6,8 +6,8 @@ from it, then the orders go out. If the write finds that the record has moved on
 the task: this driver reads again and, unless the key is its own, stops. So two coordinators never start the
 same attempt.
 
-Here are the loop and its inbox; the parts are `planning`, `dispatching`, `hearing` (news of runs) and `checking`,
-around the `keeper` of the record.
+Here are the loop and its inbox; the parts are `planning`, `dispatching`, `hearing` (news of runs), `checking` with the
+`monitor`, and `replanning`, around the `keeper` of the record.
 """
 
 import asyncio
@@ -23,16 +23,30 @@ from appliance.tasks.dispatching import Dispatching
 from appliance.tasks.hearing import Hearing
 from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import TransitionKind
+from appliance.tasks.monitor import Monitor
 from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
 from appliance.tasks.planning import plan_it
-from appliance.tasks.surroundings import CancelAsked, GatewayLost, Input, MoveReady, RunNews, Surroundings, Wake
+from appliance.tasks.replanning import Replanning
+from appliance.tasks.surroundings import (
+    Agreement,
+    CancelAsked,
+    GatewayLost,
+    Input,
+    MoveReady,
+    PlanMade,
+    RunNews,
+    Surroundings,
+    Wake,
+)
 
 log = structlog.get_logger(__name__)
 
 LOOK_AHEAD_S = 5.0
 """How often what comes is worked out anew while no subtask changes."""
 _LEAST = (RunEventKind.PROGRESS, RunEventKind.PARTIAL, RunEventKind.CHECKPOINT)
+_NEVER_LEFT = (CancelAsked, PlanMade, Agreement)
+"""News that are few and that no check would find out."""
 MAX_INBOX = 1000
 """News that may wait for a driver; beyond it progress is dropped, beyond twice that what checks find out anyway."""
 
@@ -60,8 +74,11 @@ class Driver:
         self._orders = Orders(around, self.tell)
         self._pace = Pace()
         self._hearing = Hearing(around, self._keeper, self._orders, self._pace)
-        self._dispatching = Dispatching(around, self._keeper, self._orders, self._hearing, self._pace)
-        self._checking = Checking(around, self._keeper, self._orders, self._hearing)
+        parts = (around, self._keeper, self._orders, self._hearing)
+        self._replanning = Replanning(*parts, self._pace, self.tell)
+        self._dispatching = Dispatching(*parts, self._pace, self._replanning)
+        self._monitor = Monitor(*parts, self._dispatching)
+        self._checking = Checking(*parts, self._monitor)
         self._hinted_states: tuple[SubtaskState, ...] = ()
         self._hint_at = 0.0
 
@@ -82,10 +99,12 @@ class Driver:
 
     def tell(self, news: Input) -> None:
         """Hand in what happened; never blocks. What is of no use, or too much, is dropped: checks make up for it."""
-        if isinstance(news, RunNews) and not self._hearing.useful(news.event):
-            return
+        if isinstance(news, RunNews):
+            self._monitor.seen(news.event)
+            if not self._hearing.useful(news.event):
+                return
         least = isinstance(news, Wake) or (isinstance(news, RunNews) and news.event.kind in _LEAST)
-        if self._inbox.qsize() >= (MAX_INBOX if least else 2 * MAX_INBOX) and not isinstance(news, CancelAsked):
+        if self._inbox.qsize() >= (MAX_INBOX if least else 2 * MAX_INBOX) and not isinstance(news, _NEVER_LEFT):
             return
         self._inbox.put_nowait(news)
 
@@ -111,6 +130,7 @@ class Driver:
         except SupersededError as error:
             log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
         finally:
+            self._replanning.close()
             self._orders.close()
 
     async def _next(self) -> Input:
@@ -147,6 +167,7 @@ class Driver:
         now = time.monotonic()
         if self.record.state is not TaskState.CANCELLING:
             self._hearing.tell_partials(now)
+        self._replanning.advance(now)
         self._dispatching.advance(now)
 
     async def _handle(self, news: Input) -> None:
@@ -160,6 +181,10 @@ class Driver:
                     self._keeper.apply(self._keeper.transition(TransitionKind.CANCEL))
             case MoveReady():
                 self._dispatching.move(news)
+            case PlanMade():
+                self._replanning.take_up(news)
+            case Agreement():
+                self._replanning.agree(news)
             case Wake():
                 self._pace.look_again()
 

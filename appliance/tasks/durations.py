@@ -66,6 +66,10 @@ class Durations:
         asked = params.get("duration_s", 0.0)
         return max(expected, asked) if isinstance(asked, int | float) and 0 < asked < 86_400 else expected
 
+    def seen(self, skill: str) -> tuple[float, ...]:
+        """Return how long the last runs of a skill took, oldest first."""
+        return tuple(self._seen.get(skill, ()))
+
     def add(self, skill: str, took_s: float) -> None:
         """Note a run that succeeded."""
         if not 0 <= took_s < 86_400 or (skill not in self._seen and len(self._seen) >= MOST_SKILLS):

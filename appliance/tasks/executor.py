@@ -39,6 +39,7 @@ from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.checkpoints import Checkpoints
 from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.telling import Telling
 
 log = structlog.get_logger(__name__)
 
@@ -68,11 +69,12 @@ class Executor:
         self._last: dict[str, RunEvent] = {}
         self._background: set[asyncio.Future[object]] = set()
         self._attempts: dict[tuple[str, str], int] = {}
+        self.telling = Telling(plane)
         self._checkpoints = Checkpoints(
             plane.dht,
             gateway=plane.gateway,
             max_bytes=config.max_checkpoint_bytes,
-            tell=self._publish,
+            tell=self.telling.tell,
             refuse=lambda what, reason: plane.session.refuse(what, reason=reason),
         )
         self.draining = False
@@ -180,7 +182,7 @@ class Executor:
         last try is without other gateways.
         """
         remote, inputs = self._remote, bytes_by_gateway(request.inputs)
-        avoid = remote.left_out()
+        avoid = {**remote.left_out(), **dict.fromkeys(request.avoid, "an earlier attempt failed there")}
         for left in reversed(range(REMOTE_TRIES + 1)):
             decision = await self._pool.select(
                 request.need, allow_remote=request.hops == 0 and left > 0, inputs=inputs, avoid=avoid
@@ -229,7 +231,7 @@ class Executor:
             if told.kind is RunEventKind.CHECKPOINT:
                 self._checkpoints.add(told)
             else:
-                self._publish(told)
+                self.telling.tell(told)
 
         begun = asyncio.create_task(self._keep(run_id, self._last[run_id]))
         try:
@@ -250,7 +252,7 @@ class Executor:
         await self._checkpoints.end(final)
         # Kept before it is told: a coordinator that misses the event finds it here.
         await self._keep(run_id, final)
-        self._publish(final)
+        self.telling.tell(final)
 
     async def _keep(self, run_id: str, event: RunEvent) -> None:
         """Keep an event over a restart; a store that cannot must not keep the outcome from being told."""
@@ -259,14 +261,11 @@ class Executor:
         except SwiftbotError as error:
             log.warning("run event could not be kept", run=run_id, reason=str(error))
 
-    def _publish(self, event: RunEvent) -> None:
-        self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event))
-
     def waits(self, call: Call, note: str) -> None:
         """Tell that a run waits for something, as its progress."""
         run = call.run
         last = self._last.get(run.run_id)
-        self._publish(
+        self.telling.tell(
             RunEvent(
                 task=run.task,
                 subtask=run.subtask,
@@ -355,7 +354,8 @@ class Executor:
     async def status(self, ask: RunAsk) -> RunStatus:
         """Tell what is known of a run."""
         running = ask.run_id in self._running or ask.run_id in self._accepting
-        return RunStatus(running=running, last=self._last.get(ask.run_id))
+        silent_s = self.telling.silent_s(ask.task, ask.subtask, ask.attempt) if running else None
+        return RunStatus(running=running, last=self._last.get(ask.run_id), silent_s=silent_s)
 
     async def cancel(self, ask: RunAsk) -> RunStatus:
         """Ask a run to end; its final event follows."""

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from appliance.errors import NotFoundError
-from appliance.model import Failure, RunEvent, RunEventKind, SubtaskRecord, SubtaskState
+from appliance.model import Failure, RunEvent, RunEventKind, SubtaskRecord, SubtaskState, TaskState
 from appliance.tasks import machine
 from appliance.tasks.bounds import tidy
 from appliance.tasks.keeper import Keeper
@@ -14,6 +14,7 @@ from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
 from appliance.tasks.partials import Partials, shown
+from appliance.tasks.replan.decide import worth_replanning
 from appliance.tasks.surroundings import Surroundings
 
 
@@ -26,10 +27,12 @@ class Hearing:
         self._orders = orders
         self._pace = pace
         self._partials = Partials()
+        self.gives_way: set[str] = set()
+        """Subtasks whose runs are being ended because a new plan leaves them out."""
 
     def useful(self, event: RunEvent) -> bool:
         """Whether an event is of a current attempt and tells something that the record keeps."""
-        if event.kind is RunEventKind.LOG:
+        if event.kind in (RunEventKind.LOG, RunEventKind.ALIVE):
             return False
         current = next((each for each in self._keeper.record.subtasks if each.subtask.id == event.subtask), None)
         return current is not None and event.attempt == current.attempt and not current.state.final
@@ -88,6 +91,8 @@ class Hearing:
                     TransitionKind.SUCCEEDED,
                     result=event.result,
                     duration_ms=event.duration_ms,
+                    cpu_ms=event.cpu_ms,
+                    peak_mb=event.peak_mb,
                     choice=choice,
                     **common,
                 )
@@ -95,7 +100,7 @@ class Hearing:
                     self._around.took(target.subtask.skill, event.duration_ms)
             case RunEventKind.FAILED:
                 failure = event.failure or Failure(code="internal", message="the run failed without a reason")
-                self.attempt_failed(target, failure, event.duration_ms)
+                self.attempt_failed(target, failure, event.duration_ms, event=event)
             case RunEventKind.PARTIAL:
                 self._partials.add(event)
             case RunEventKind.CHECKPOINT:
@@ -111,11 +116,20 @@ class Hearing:
                 failure = Failure(code="unreachable", message=f"{gateway} was lost", retryable=True)
                 self.attempt_failed(each, failure, None)
 
-    def attempt_failed(self, target: SubtaskRecord, failure: Failure, duration_ms: float | None) -> None:
-        """Note that an attempt has failed, and whether another will be made."""
+    def give_way(self, target: SubtaskRecord, why: str) -> None:
+        """Give up a run that a new plan leaves out and that does not end when told to."""
+        self.gives_way.add(target.subtask.id)
+        self.attempt_failed(target, Failure(code="cancelled", message=why), None)
+
+    def attempt_failed(
+        self, target: SubtaskRecord, failure: Failure, duration_ms: float | None, *, event: RunEvent | None = None
+    ) -> None:
+        """Note that an attempt has failed, and whether another will be made; `event`: what its gateway told of it."""
         keeper = self._keeper
         judged = _with_failure(target, failure)
-        give_up = machine.gives_up(judged, failure, retries=self._retries(target) + 1)
+        leaves = target.subtask.id in self.gives_way
+        give_up = leaves or machine.gives_up(judged, failure, retries=self._retries(target) + 1)
+        replan = leaves or worth_replanning(failure.code)
         taken = keeper.take(
             keeper.transition(
                 TransitionKind.ATTEMPT_FAILED,
@@ -124,7 +138,10 @@ class Hearing:
                 gateway=target.gateway,
                 failure=failure,
                 give_up=give_up,
+                replan=give_up and replan and keeper.record.state is TaskState.RUNNING,
                 duration_ms=duration_ms,
+                cpu_ms=event.cpu_ms if event else None,
+                peak_mb=event.peak_mb if event else None,
                 choice=self._orders.choice(target.subtask.id, target.attempt),
             )
         )

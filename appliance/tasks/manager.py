@@ -49,6 +49,7 @@ from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
+from appliance.tasks.agreeing import Agreeing
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_deep
 from appliance.tasks.checkpoints import Checkpoint, read_checkpoint, remove_checkpoint
@@ -58,6 +59,7 @@ from appliance.tasks.listing import newest_tasks
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement, bind, holds, place
+from appliance.tasks.recovery import Recovery
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, need_of, task_key
 
@@ -98,6 +100,14 @@ class TaskManager:
         self._final: dict[str, VersionVector] = {}
         """Records of the shard known to be final, which need not be decoded at every sweep."""
         self._ahead = LookAhead(plane, manifest=self.manifest, likely_place=self._likely_place, tell_here=executor.hint)
+        self.recovery = Recovery(
+            plane,
+            catalogue=catalogue,
+            decomposer=decomposer,
+            site=site,
+            durations=self._ahead.durations,
+            busy=self._busy_robots,
+        )
         self._closers: list[Callable[[], None]] = []
         self._stopping = False
         self._sweep = asyncio.Event()
@@ -120,6 +130,7 @@ class TaskManager:
         rpc.register("tasks", TasksAsk, self.tasks)
         rpc.register("cancel", TaskAsk, self.cancel)
         rpc.register("cancel_here", TaskAsk, self.cancel_here)
+        Agreeing(self.plane, self._drivers, self.task).register()
         news = self.plane.session.subscribe_typed(self.plane.keys.run(), RunEvent, self._on_run_event)
         self._closers.append(news.close)
         self.plane.on_member_lost.append(self._on_member_lost)

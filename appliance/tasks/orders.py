@@ -64,6 +64,7 @@ def request_for(
         submitter=record.submitter,
         group=record.group.members if record.group else (),
         moves=sum(bool(each.left) for each in target.attempts),
+        avoid=tuple(sorted({each.gateway for each in target.attempts if each.failure and each.gateway})),
     )
 
 

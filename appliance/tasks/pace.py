@@ -10,6 +10,7 @@ class Pace:
     def __init__(self) -> None:
         self.not_before: dict[str, float] = {}
         self._reasons: dict[str, str] = {}
+        self._since: dict[str, float] = {}
 
     @property
     def waiting(self) -> bool:
@@ -26,12 +27,18 @@ class Pace:
     def goes(self, subtask: str) -> None:
         """It waits no more."""
         self._reasons.pop(subtask, None)
+        self._since.pop(subtask, None)
+
+    def waited_s(self, subtask: str, now: float) -> float:
+        """Seconds since a subtask began to wait for what it still waits for."""
+        return now - self._since.get(subtask, now)
 
     def waits(self, subtask: str, reason: str, now: float) -> bool:
         """Note why it waits, and look again soon; returns whether the reason is a new one."""
         self.not_before[subtask] = now + LOOK_AGAIN_S
         new = self._reasons.get(subtask) != reason
         self._reasons[subtask] = reason
+        self._since.setdefault(subtask, now)
         return new
 
     def repeats(self, subtask: str, at: float) -> None:

@@ -12,7 +12,16 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from msgspec import Struct
 
-from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, SubtaskRecord, TaskRecord
+from appliance.model import (
+    ContainerInfo,
+    ContainerState,
+    GatewayStatus,
+    Need,
+    RobotInfo,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+)
 from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.settings import TasksConfig
 
@@ -124,18 +133,17 @@ def bind(
     Returns:
         The robot and "", or None and the reason for the wait.
     """
-    if not _ANY.fullmatch(label):
-        robot = robots.get(label)
-        if robot is None or not robot.online:
-            return None, f"waits for {label}: {'offline' if robot else 'not in the roster'}"
-        return label, ""
     mine = [each for each in records if each.subtask.robot == label]
-    for each in mine:
-        if each.bound_robot:
-            bound = robots.get(each.bound_robot)
-            if bound is None or not bound.online:
-                return None, f"waits for {each.bound_robot}: {'offline' if bound else 'not in the roster'}"
-            return each.bound_robot, ""
+    # What is not done yet counts first: another robot may have taken over from the one that did the rest.
+    first = sorted(mine, key=lambda each: each.state is SubtaskState.SUCCEEDED)
+    bound = next((each.bound_robot for each in first if each.bound_robot), None)
+    if bound is None and not _ANY.fullmatch(label):
+        bound = label
+    if bound is not None:
+        robot = robots.get(bound)
+        if robot is None or not robot.online:
+            return None, f"waits for {bound}: {'offline' if robot else 'not in the roster'}"
+        return bound, ""
     taken = {each.bound_robot for each in records if each.bound_robot}
     named = {each.subtask.robot for each in records if each.subtask.robot}
     able = [

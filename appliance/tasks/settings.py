@@ -1,6 +1,9 @@
 """Configuration of the task manager."""
 
-from msgspec import Struct
+from msgspec import Struct, field
+
+from appliance.tasks.detection import DetectionConfig
+from appliance.tasks.replan.settings import ReplanConfig
 
 
 class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -32,3 +35,7 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """How often old records are looked for."""
     keep_finished: int = 500
     """Finished task records kept in this gateway's shard."""
+    detection: DetectionConfig = field(default_factory=DetectionConfig)
+    """When a run is taken for stuck or straggling."""
+    replan: ReplanConfig = field(default_factory=ReplanConfig)
+    """What may be done about a subtask that was given up."""

@@ -1,7 +1,7 @@
 """What a driver needs of its gateway, and what it is told: the seam between driving a task and the world."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from msgspec import Struct
@@ -13,7 +13,33 @@ from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.bounds import MAX_RUN_S
 from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.placement import Placement
+from appliance.tasks.replan.robots import Robots
 from appliance.tasks.settings import TasksConfig
+
+
+class Recovering(Protocol):
+    """What finding runs that go wrong and revising plans needs; `tasks.recovery` provides it."""
+
+    @property
+    def manifests(self) -> Mapping[str, SkillManifest]:
+        """Manifests by skill, of those known here."""
+        ...
+
+    def robots(self) -> Robots:
+        """Return the roster as it is known now."""
+        ...
+
+    def experience(self, skill: str) -> Sequence[float]:
+        """Return how long the last runs of a skill took, seconds."""
+        ...
+
+    def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
+        """Count what was found or done, and say it in the log."""
+        ...
+
+    async def replan(self, record: TaskRecord) -> Plan:
+        """Have the decomposer plan anew what is left; PlanError when it cannot."""
+        ...
 
 
 class Surroundings(Protocol):
@@ -21,6 +47,11 @@ class Surroundings(Protocol):
 
     plane: Plane
     config: TasksConfig
+
+    @property
+    def recovery(self) -> Recovering:
+        """What finding runs that go wrong and revising plans needs."""
+        ...
 
     async def plan(self, record: TaskRecord) -> Plan:
         """Return a valid plan, the one handed in with the task or a new one; PlanError otherwise."""
@@ -106,7 +137,22 @@ class MoveReady(Struct, frozen=True, kw_only=True):
             self.outcome.set_result(self.next_attempt)
 
 
-Input = RunNews | GatewayLost | CancelAsked | MoveReady | Wake
+class PlanMade(Struct, frozen=True, kw_only=True):
+    """The decomposer has answered: the new plan, or None; `why` it was asked, and what it said."""
+
+    subtask: str
+    plan: Plan | None
+    why: str
+
+
+class Agreement(Struct, frozen=True, kw_only=True):
+    """An operator's word on a proposed plan."""
+
+    agree: bool
+    by: str = ""
+
+
+Input = RunNews | GatewayLost | CancelAsked | MoveReady | PlanMade | Agreement | Wake
 
 
 def figures(plane: Plane, gateway: str) -> dict[str, Any]:

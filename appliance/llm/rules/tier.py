@@ -4,6 +4,7 @@ import asyncio
 
 from appliance.errors import PlanError
 from appliance.llm.rules.domains import domain_of
+from appliance.llm.rules.mending import mend
 from appliance.llm.rules.parser import Parser, Reading
 from appliance.llm.settings import PlanContext
 from appliance.llm.tier import Proposal
@@ -49,6 +50,9 @@ class RulesTier:
     ) -> Proposal:
         """Parse; PlanError names what was not understood when nothing was."""
         del previous, problems
+        if context.so_far is not None:
+            plan = mend(context.so_far, self._catalogue, context.robots)
+            return Proposal(plan=plan, confidence=plan.confidence)
         # In a thread: a long text takes a quarter of a second, and the loop has leases to keep.
         plan, reading = await asyncio.to_thread(read, context, self._catalogue)
         lost = tuple(f"not understood: {piece!r}" for piece in reading.lost)

@@ -29,9 +29,9 @@ class GiveUp(Struct, frozen=True, kw_only=True):
 Decision = Rebinding | Substitution | AskDecomposer | GiveUp
 
 
-def worth_replanning(record: TaskRecord, failure_code: str, config: ReplanConfig) -> bool:
-    """Whether a subtask that is given up is looked at at all: not when somebody stopped it or enough was revised."""
-    return failure_code != "cancelled" and record.revised < config.max_revisions
+def worth_replanning(failure_code: str) -> bool:
+    """Whether a subtask that is given up is looked at at all: not when somebody stopped it."""
+    return failure_code != "cancelled"
 
 
 def decide(

@@ -13,12 +13,13 @@ from typing import Any, cast
 import msgspec
 import pytest
 
-from appliance.errors import ConflictError, NotFoundError, SwiftbotError, UnreachableError
+from appliance.errors import ConflictError, NotFoundError, PlanError, SwiftbotError, UnreachableError
 from appliance.model import (
     Choice,
     Need,
     Phase,
     Plan,
+    RobotInfo,
     RunAccepted,
     RunEvent,
     RunEventKind,
@@ -39,6 +40,7 @@ from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement
+from appliance.tasks.replan.robots import Robots
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.surroundings import Input, RunNews, task_key
 
@@ -322,6 +324,45 @@ def accepted(task: str = "t-1", plan: Plan | None = None, coordinator: str = "gw
     )
 
 
+class FakeRecovery:
+    """Facts for the monitor and replanning; `new_plan` is what the decomposer answers."""
+
+    def __init__(self, skills: Callable[[], dict[str, SkillManifest]]) -> None:
+        self._skills = skills
+        self.roster: dict[str, RobotInfo] = {}
+        self.known: dict[str, tuple[float, ...]] = {}
+        self.noted: list[str] = []
+        self.new_plan: Plan | Exception = PlanError("no planner is configured")
+        self.asked: list[TaskRecord] = []
+        self.asking: asyncio.Event | None = None
+
+    @property
+    def manifests(self) -> dict[str, SkillManifest]:
+        """Return the manifests."""
+        return self._skills()
+
+    def robots(self) -> Robots:
+        """Return the roster."""
+        return Robots(roster=self.roster)
+
+    def experience(self, skill: str) -> tuple[float, ...]:
+        """Return what is known."""
+        return self.known.get(skill, ())
+
+    def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
+        """Remember."""
+        self.noted.append(what)
+
+    async def replan(self, record: TaskRecord) -> Plan:
+        """Return the new plan or raise it."""
+        self.asked.append(record)
+        if self.asking is not None:
+            await self.asking.wait()
+        if isinstance(self.new_plan, Exception):
+            raise self.new_plan
+        return self.new_plan
+
+
 class FakeSurroundings:
     """What a driver needs, with all of it in the test's hands."""
 
@@ -329,6 +370,7 @@ class FakeSurroundings:
         self.plane = plane
         self.config = FAST
         self.skills = {"work": manifest()}
+        self.recovery = FakeRecovery(lambda: self.skills)
         self.the_plan: Plan | Exception = plan or plan_of()
         self.planning: asyncio.Event | None = None
         self.robot: tuple[str | None, str] = ("r1", "")
