@@ -204,13 +204,22 @@ class Session:
 
         A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
         and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
+
+        A question that was meant for another key is refused as `unreachable`: after links were made anew Zenoh 1.10 has
+        been seen to deliver a query to the wrong queryable of a session or process, which made one robot do another's
+        command. `query` writes down for whom it is; what other Zenoh clients ask says nothing of it.
         """
         limit, running, name = self.config.max_payload_bytes, set[asyncio.Task[None]](), self._name(expr)
 
         def take(query: zenoh.Query) -> None:
             key, payload = str(query.key_expr), query.payload
             size = len(payload) if payload is not None else 0
-            if size > limit:
+            meant = query.attachment.to_bytes() if query.attachment is not None else b""
+            if meant and "*" not in expr and meant != expr.encode():
+                error = UnreachableError(f"{expr}: the question is not for this", remedy="ask again in a moment")
+                begin = partial(self._refuse_query, f"misrouted {name}", query, expr, error)
+                size = 0
+            elif size > limit:
                 error = PayloadError(f"{key}: {size:,} bytes", remedy=f"at most {limit:,}")
                 begin = partial(self._refuse_query, f"oversize {name}", query, expr, error)
                 size = 0
@@ -297,7 +306,7 @@ class Session:
 
         try:
             target = zenoh.QueryTarget.BEST_MATCHING
-            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk)
+            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, meant=key.encode())
             async with asyncio.timeout(timeout_s):
                 return await answer
         except TimeoutError:
@@ -333,6 +342,7 @@ class Session:
         *,
         target: zenoh.QueryTarget,
         bulk: bool = False,
+        meant: bytes | None = None,
     ) -> None:
         limit = self.config.max_payload_bytes
         if len(payload) > limit:
@@ -365,6 +375,7 @@ class Session:
             priority=zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA,
             express=True,
             payload=payload,
+            attachment=meant,
         )
         self._send(expr, cast("Callable[[], None]", send), len(payload))
 

@@ -213,6 +213,30 @@ async def test_bad_requests_are_answered_with_the_reason(pair: tuple[Session, Se
     assert await one.query(key, b'{"image": "x"}', timeout_s=5) == b'{"image":"x"}'
 
 
+async def test_a_question_for_another_key_is_refused(pair: tuple[Session, Session]) -> None:
+    """A query that Zenoh delivers to the wrong queryable reaches no handler: it is counted and may be asked again."""
+    one, other = pair
+    reached: list[str] = []
+
+    async def handle(key: str, payload: bytes) -> bytes:
+        reached.append(key)
+        return payload
+
+    key = other.keys.command("rover_2")
+    other.serve(key, handle)
+    await _heard(one, other)
+    wrong = one.keys.command("rover_4").encode()
+    foreign = await asyncio.to_thread(lambda: list(one._raw.get(key, payload=b"x", attachment=wrong, timeout=5)))
+    assert foreign[0].err is not None
+    assert msgspec.json.decode(foreign[0].err.payload.to_bytes(), type=ErrorReply).code == "unreachable"
+    assert reached == []
+    assert other.refused == {"misrouted robot/rover_2/command": 1}
+    plain = await asyncio.to_thread(lambda: list(one._raw.get(key, payload=b"x", timeout=5)))
+    assert plain[0].ok is not None
+    assert await one.query(key, b"x", timeout_s=5) == b"x"
+    assert reached == [key, key]
+
+
 async def test_exchanges_can_be_watched(pair: tuple[Session, Session]) -> None:
     """Each exchange is put: request and reply as JSON, what is too large by digest, errors by code."""
     one, other = pair
