@@ -30,6 +30,16 @@ from appliance.pool.api import (
 )
 from appliance.pool.transfer.api import Brought, FetchAsk
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.migration.api import (
+    DrainAsk,
+    DrainState,
+    DrainStateAsk,
+    MigrateAsk,
+    Migrated,
+    MoveAsk,
+    MoveCancelled,
+)
+from appliance.tasks.migration.moving import MOVE_S
 
 R = TypeVar("R", bound=Struct)
 
@@ -125,6 +135,36 @@ class FleetClient:
     async def cancel(self, task: str) -> TaskRecord:
         """Stop a task."""
         return await self._ask("cancel", TaskAsk(id=task), TaskRecord)
+
+    # --- moving runs --------------------------------------------------------------------------------------------
+
+    async def migrate(self, ask: MigrateAsk) -> Migrated:
+        """Move a subtask's run to another gateway; returns when it has started there.
+
+        Raises:
+            NotFoundError, RefusedError: it cannot be moved, with the reason; it goes on where it is.
+            CancelledByOperatorError: somebody called it off.
+        """
+        return await self.plane.rpc.call(await self.gateway(), "migrate", ask, Migrated, timeout_s=MOVE_S)
+
+    async def migrate_cancel(self, task: str, subtask: str) -> bool:
+        """Call off a move that is under way; False when it is too late, or there is none."""
+        ask = MoveAsk(task=task, subtask=subtask)
+        return (await self._ask("migrate_cancel", ask, MoveCancelled)).cancelled
+
+    async def drain(self, gateway: str, deadline_s: float) -> DrainState:
+        """Have a gateway give all its runs away and take no more; returns at once."""
+        await self._known(gateway)
+        return await self.plane.rpc.call(gateway, "drain", DrainAsk(deadline_s=deadline_s), DrainState)
+
+    async def undrain(self, gateway: str) -> DrainState:
+        """Have a gateway take runs again."""
+        await self._known(gateway)
+        return await self.plane.rpc.call(gateway, "undrain", DrainStateAsk(), DrainState)
+
+    async def drain_state(self, gateway: str) -> DrainState:
+        """How far a gateway is with giving its runs away."""
+        return await self.plane.rpc.call(gateway, "drain_state", DrainStateAsk(), DrainState)
 
     # --- pools ------------------------------------------------------------------------------------------------
 

@@ -48,6 +48,9 @@ from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
+from appliance.tasks.migration.leaving import Leaving
+from appliance.tasks.migration.migration import Migration
+from appliance.tasks.migration.overload import Load
 from appliance.tasks.remote import Links, RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
 from appliance.vitals import Vitals
@@ -119,7 +122,7 @@ class Gateway:
         remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=links)
 
         async def on_call(call: Call) -> dict[str, object]:
-            return await calls(call)
+            return await self._leaving.guard(call, calls)
 
         self.pool = Pool(
             config.pool,
@@ -137,6 +140,7 @@ class Gateway:
         )
         self.executor = Executor(self.plane, self.pool, remote, config.tasks)
         self.executor.on_change = self._changed.set
+        self._leaving = Leaving(config.id, self.executor, skills=catalogue.skills, config=config.tasks.migration)
         await self.executor.start()
         await self.pool.start()
         self._stack.push_async_callback(self._stop_pool)
@@ -164,6 +168,19 @@ class Gateway:
         self.manager.on_change = self._changed.set
         await self.manager.start()
         self._stack.push_async_callback(self.manager.stop)
+        self.migration = Migration(
+            self.plane,
+            self.pool,
+            executor=self.executor,
+            leaving=self._leaving,
+            tasks=self.manager,
+            config=config.tasks.migration,
+            load=self._own_load,
+            volumes_mb=lambda names: self._volumes.size_bytes(names) / 2**20 if self._volumes is not None else 0.0,
+            on_change=self._changed.set,
+        )
+        self.migration.start()
+        self._stack.push_async_callback(self.migration.close)
         self._ready.set()
         self._stack.callback(self._drop_intake)
         self._publish_status()
@@ -239,14 +256,25 @@ class Gateway:
     async def stop(self) -> None:
         """Drain, then stop every part in reverse order."""
         self._draining = True
-        self.executor.draining = True
+        draining = self.migration.draining
+        draining.begin(max(0.001, self.config.drain_s), stopping=True)
         self._publish_status()
-        log.info("gateway drains", runs=self.executor.running, deadline_s=self.config.drain_s)
         try:
-            await self.executor.drain(self.config.drain_s)
+            await draining.until_empty()
+            await self.executor.drain(0.0)
             await self.manager.settle(SETTLE_S)
         finally:
             await self._stack.aclose()
+
+    def _own_load(self) -> Load:
+        """What this gateway sees of itself, by which it knows that it is overloaded."""
+        return Load(
+            cpu=self._vitals.read().cpu_percent / 100,
+            processors=float(os.cpu_count() or 1),
+            squeeze=self.pool.squeeze,
+            queue=self.pool.queue,
+            capacity=self.config.pool.capacity,
+        )
 
     # --- facts about this gateway ---------------------------------------------------------------------------
 
@@ -329,7 +357,9 @@ class Gateway:
             running=self.executor.running,
             queue=self.pool.queue,
             tasks=self.manager.unfinished,
-            draining=self._draining,
+            draining=self._draining or self.executor.draining,
+            drain=self.migration.draining.text,
+            overloaded=self.migration.shedding.reason,
             limits_enforced=self.pool.limits_enforced,
             pool_problem=self.pool.problem or self.pool.squeeze,
             images=self._transfers.images() if self._transfers is not None else (),

@@ -261,6 +261,11 @@ class _Starting:
             pool=self._order.pool_of(name),
             robots=msgspec.structs.replace(base.robots, mavlink=links),
             record=RecordConfig(directory=str(record_dir)),
+            tasks=msgspec.structs.replace(
+                # They share this machine's processors: none is relieved by another.
+                base.tasks,
+                migration=msgspec.structs.replace(base.tasks.migration, cpu_high=0.0),
+            ),
         )
 
     def _spawn(self, name: str, *arguments: str) -> None:

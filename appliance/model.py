@@ -556,6 +556,10 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     tasks: int = 0
     """Tasks it coordinates that have not ended."""
     draining: bool = False
+    drain: str = ""
+    """While it drains: how far it is, and what the runs that are left wait for."""
+    overloaded: str = ""
+    """Why runs are moved away from it, or were lately: it is given none meanwhile. Empty when all is well."""
     limits_enforced: bool = True
     """False where the kernel's cgroups do not let rootless containers be limited."""
     pool_problem: str = ""

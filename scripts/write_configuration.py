@@ -28,6 +28,7 @@ SECTIONS = (
     ("tasks", "appliance.tasks.settings", "TasksConfig"),
     ("tasks.detection", "appliance.tasks.detection", "DetectionConfig"),
     ("tasks.replan", "appliance.tasks.replan.settings", "ReplanConfig"),
+    ("tasks.migration", "appliance.tasks.migration.settings", "MigrationConfig"),
 )
 HEAD = """# Configuration
 

@@ -15,7 +15,7 @@ from appliance.errors import NotFoundError, SwiftbotError
 from appliance.model import PLAIN_PRIORITY, TaskRecord, TaskRequest, TaskState
 from appliance.tasks.view import view
 
-task_app = App(name="task", help="List, show and cancel tasks.", group=WORK)
+task_app = App(name="task", help="List, show, cancel and move tasks.", group=WORK)
 
 
 def add_to(app: App) -> None:

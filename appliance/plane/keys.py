@@ -69,6 +69,10 @@ class Keys:
         """Put: LogLine."""
         return f"{self.root}/gw/{gateway}/log"
 
+    def migration(self, gateway: str = "*") -> str:
+        """Put by a gateway that wants runs moved away: MigrationRequest."""
+        return f"{self.root}/gw/{gateway}/migration"
+
     # tasks
     def task(self, task: str = "*") -> str:
         """Put by the coordinator on every change: TaskRecord."""

@@ -182,6 +182,20 @@ class Books:
         self.hold(container, FOR_A_RUN if container.reservation == FOR_A_RUN else FOR_STATE)
         container.lease_until = math.inf
 
+    def extend(self, container_id: str, reservation: str, lease_s: float) -> bool:
+        """Hold a reserved container for so long from now; False when it is not held under that name any more."""
+        held = self._held.get(container_id)
+        if held is None or not reservation or held.reservation != reservation:
+            return False
+        held.lease_until = time.monotonic() + lease_s
+        return True
+
+    def release(self, container_id: str, reservation: str) -> None:
+        """Let go of a reserved container that is not wanted any more."""
+        held = self._held.get(container_id)
+        if held is not None and reservation and held.reservation == reservation:
+            self.give_back(held)
+
     def give_back(self, container: PooledContainer) -> None:
         """Let go of a container that was held or started for a run which does not want it any more."""
         container.reservation = ""

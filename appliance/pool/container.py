@@ -211,6 +211,10 @@ class PooledContainer:
         )
         return bool(reply.get("ok"))
 
+    async def save(self, run_id: str) -> bool:
+        """Ask a run's handler for a checkpoint; False when the runner has no run of that id."""
+        return bool((await self._ask({"op": "save", "run": run_id}, CONTROL_TIMEOUT_S)).get("ok"))
+
     async def begin(self, order: Frame) -> Connection:
         """Send a run on the spare connection and return it; UnreachableError when the runner is gone."""
         connection, self._spare = self._spare, None

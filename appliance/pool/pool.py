@@ -285,6 +285,18 @@ class Pool:
         """In how many seconds the run at a place in the queue (from 1) may have a container; None: not known."""
         return self._keeper.expected_s(position)
 
+    async def save(self, run_id: str) -> bool:
+        """Ask a run's handler for a checkpoint now; False when there is none that could hear it."""
+        return await self._runs.save(run_id)
+
+    def keep(self, decision: Decision, lease_s: float) -> bool:
+        """Hold a selected container for longer than the usual lease; False when it is held no more."""
+        return self._keeper.books.extend(decision.container or "", decision.reservation, lease_s)
+
+    def release(self, decision: Decision) -> None:
+        """Let go of a selected container that will not be used."""
+        self._keeper.books.release(decision.container or "", decision.reservation)
+
     async def cancel(self, run_id: str) -> bool:
         """Ask a run to end; its last event follows from `run`. False when there is none of that id."""
         return await self._runs.cancel(run_id)

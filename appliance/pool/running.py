@@ -232,6 +232,16 @@ class Runs:
         finally:
             connection.close()
 
+    async def save(self, run_id: str) -> bool:
+        """Ask a run's handler for a checkpoint; False when there is no such run in a container, or it is deaf."""
+        run = self._runs.get(run_id)
+        if run is None or run.container is None or run.cancelled:
+            return False
+        try:
+            return await run.container.save(run_id)
+        except SwiftbotError:
+            return False
+
     async def cancel(self, run_id: str) -> bool:
         """Ask a run to end; its last event follows from `run`. False when there is none of that id."""
         run = self._runs.get(run_id)

@@ -113,11 +113,20 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Longest that its handler goes without a sign of life: a run that is silent for longer is stuck. 0: not said."""
     speculate: bool = False
     """Whether a run that takes much longer than others may be left for a new attempt elsewhere."""
+    checkpoints: bool = False
+    """Whether its handler saves a checkpoint when `ctx.checkpoint_due()` says so: worth waiting for before a move."""
+    moves: Literal["", "anytime", "between commands", "never"] = ""
+    """When a run may be moved to another gateway. Empty: `anytime`, or `never` if it sends robot commands."""
 
     implemented: bool = False
     """Whether `handler.py` is there. Set by the loader, never in the file."""
     folder: Path = Path()
     """Where it was read from. Set by the loader, never in the file."""
+
+    @property
+    def mobility(self) -> Literal["anytime", "between commands", "never"]:
+        """When a run of it may be moved to another gateway."""
+        return self.moves or ("never" if self.verbs else "anytime")
 
 
 class ImageSpec(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -9,7 +9,7 @@ one to the next attempt and removes it when the task has ended; `retention` remo
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import msgspec
@@ -93,8 +93,15 @@ class _Run:
         self.newest: RunEvent | None = None
         self.version: VersionVector | None = None
         self.writer: asyncio.Task[None] | None = None
-        self.hurry = asyncio.Event()
+        self.wake = asyncio.Event()
+        """What waits is to be written at once."""
+        self.ended = False
         self.outdated = False
+        self.taken = 0
+        """Checkpoints that came."""
+        self.kept = 0
+        """How many of them had come when the last write was done."""
+        self.written = asyncio.Event()
 
 
 class Checkpoints:
@@ -136,17 +143,49 @@ class Checkpoints:
         key = _key(event)
         run = self._runs.setdefault(key, _Run())
         run.newest = event
+        run.taken += 1
         if run.writer is None:
             run.writer = asyncio.create_task(
                 self._keep_writing(key, run), name=f"checkpoints of {'/'.join(map(str, key))}"
             )
+
+    def any_of(self, run_id: tuple[str, str, int]) -> bool:
+        """Whether a checkpoint of a run has come."""
+        run = self._runs.get(run_id)
+        return run is not None and run.taken > 0
+
+    async def fresh(
+        self, run_id: tuple[str, str, int], ask: Callable[[], Awaitable[bool]], *, wait_s: float, may_save: bool
+    ) -> bool:
+        """Have the newest checkpoint of a run written now; returns whether one came for the asking.
+
+        Args:
+            run_id: task, subtask, attempt.
+            ask: tells the run's handler that a checkpoint is wanted; False when it cannot hear.
+            wait_s: how long to wait for it, and for what came to be written.
+            may_save: whether its skill says that it saves when it is asked to.
+        """
+        run = self._runs.setdefault(run_id, _Run())
+        before, wanted = run.taken, run.taken
+        if (may_save or run.taken) and await ask():
+            wanted += 1
+        try:
+            async with asyncio.timeout(wait_s):
+                while not run.outdated and (run.taken < wanted or run.kept < run.taken):
+                    run.wake.set()
+                    run.written.clear()
+                    await run.written.wait()
+        except TimeoutError:
+            log.info("a run goes from its last checkpoint", run="/".join(map(str, run_id)), waited_s=wait_s)
+        return run.taken > before and run.kept == run.taken
 
     async def end(self, event: RunEvent) -> None:
         """A run has ended: what waits is written if another attempt may go on from it, else dropped."""
         run = self._runs.pop(_key(event), None)
         if run is None or run.writer is None:
             return
-        run.hurry.set()
+        run.ended = True
+        run.wake.set()
         if event.kind is RunEventKind.SUCCEEDED:
             run.newest = None
             return
@@ -157,16 +196,20 @@ class Checkpoints:
     async def _keep_writing(self, key: tuple[str, str, int], run: _Run) -> None:
         """Write the newest one, again and again, until the run has ended or nothing came for a while."""
         while (event := run.newest) is not None and not run.outdated:
-            run.newest = None
+            run.newest, taken = None, run.taken
             try:
                 await self._write(event, run)
+                run.kept = taken
             except SwiftbotError as error:
                 log.warning("a checkpoint could not be kept", task=event.task, subtask=event.subtask, reason=str(error))
+            run.written.set()
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(EVERY_S):
-                    await run.hurry.wait()
+                async with asyncio.timeout(0.0 if run.ended else EVERY_S):
+                    await run.wake.wait()
+            run.wake.clear()
         run.writer = None
-        if run.hurry.is_set() or run.outdated:
+        run.written.set()
+        if run.ended or run.outdated:
             self._runs.pop(key, None)
 
     async def _write(self, event: RunEvent, run: _Run) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import structlog
+from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PayloadError, PoolError, RefusedError, SwiftbotError, UnreachableError
@@ -52,6 +53,16 @@ KEPT_RUNS = 2000
 """Last events kept of ended runs; a coordinator asks within seconds."""
 
 
+class Here(Struct):
+    """A run in progress on this gateway."""
+
+    request: RunRequest
+    since: float
+    """When it was accepted, on this machine's monotonic clock."""
+    began: bool = False
+    """Whether its handler has run its first line."""
+
+
 class Executor:
     """The runs of one gateway."""
 
@@ -62,6 +73,7 @@ class Executor:
         self._records: Closer | None = None
         self._pool = pool
         self._running: dict[str, asyncio.Task[None]] = {}
+        self._here: dict[str, Here] = {}
         self._accepted: dict[str, RunAccepted] = {}
         self._accepting: dict[str, asyncio.Task[RunAccepted]] = {}
         self._withdrawn: set[str] = set()
@@ -79,11 +91,17 @@ class Executor:
         )
         self.draining = False
         self.on_change: Callable[[], None] = lambda: None
+        self.reserved: Callable[[RunRequest], Decision | None] = lambda _: None
+        """The container that is held for a run which is moved here, if there is one."""
 
     @property
     def running(self) -> int:
         """Runs in progress."""
         return len(self._running)
+
+    def here(self) -> dict[str, Here]:
+        """Return the runs in progress by their ids."""
+        return dict(self._here)
 
     async def start(self) -> None:
         """Load what was kept; a run that was in progress when the gateway went down has failed."""
@@ -171,6 +189,7 @@ class Executor:
         self._remember(run_id, begun)
         task = asyncio.create_task(self._carry_out(request, decision, received_ns), name=f"run {run_id}")
         self._running[run_id] = task
+        self._here[run_id] = Here(request, time.monotonic())
         task.add_done_callback(lambda done: self._ended(run_id, done))
         self.on_change()
         return accepted
@@ -181,6 +200,8 @@ class Executor:
         An offer that turns out to be nothing is counted, explained in the choice, and the next best is taken; the
         last try is without other gateways.
         """
+        if (reserved := self.reserved(request)) is not None:
+            return reserved
         remote, inputs = self._remote, bytes_by_gateway(request.inputs)
         avoid = {**remote.left_out(), **dict.fromkeys(request.avoid, "an earlier attempt failed there")}
         for left in reversed(range(REMOTE_TRIES + 1)):
@@ -228,6 +249,7 @@ class Executor:
                 told = replace(told, startup_ms=told.startup_ms + waited_ms)
             if told.kind is RunEventKind.STARTED:
                 self._last[run_id] = told
+                self._here[run_id].began = True
             if told.kind is RunEventKind.CHECKPOINT:
                 self._checkpoints.add(told)
             else:
@@ -342,6 +364,7 @@ class Executor:
 
     def _ended(self, run_id: str, done: "asyncio.Task[None]") -> None:
         self._running.pop(run_id, None)
+        self._here.pop(run_id, None)
         if not done.cancelled() and (error := done.exception()) is not None:
             # The coordinator asks after the run, sees that it has ended with nothing, and repeats it.
             log.error("run was not brought to its end", run=run_id, exc_info=error)
@@ -363,6 +386,31 @@ class Executor:
             self._withdrawn.add(ask.run_id)
         if ask.run_id in self._running:
             await self._pool.cancel(ask.run_id)
+        return await self.status(ask)
+
+    def check(self, request: RunRequest) -> None:
+        """Raise RefusedError when an order could not begin here: draining, or outdated."""
+        self._check(request)
+
+    async def save(self, ask: RunAsk, *, wait_s: float, may_save: bool) -> bool:
+        """Have a run's newest checkpoint in the DHT now; returns whether its handler saved one for this.
+
+        `may_save`: its skill says that it saves when it is asked; of others what they saved by themselves is written.
+        """
+        run = (ask.task, ask.subtask, ask.attempt)
+        return await self._checkpoints.fresh(run, lambda: self._pool.save(ask.run_id), wait_s=wait_s, may_save=may_save)
+
+    def saved(self, ask: RunAsk) -> bool:
+        """Whether a run has saved a checkpoint, or goes on from one."""
+        here = self._here.get(ask.run_id)
+        before = here is not None and here.request.resume is not None
+        return before or self._checkpoints.any_of((ask.task, ask.subtask, ask.attempt))
+
+    async def end(self, ask: RunAsk, *, wait_s: float) -> RunStatus:
+        """Have a run end and wait until it has, its last words kept and its volumes noted; or for so long."""
+        await self.cancel(ask)
+        if (task := self._running.get(ask.run_id)) is not None:
+            await asyncio.wait({task}, timeout=wait_s)
         return await self.status(ask)
 
     async def drain(self, deadline_s: float) -> None:

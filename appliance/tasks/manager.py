@@ -406,6 +406,9 @@ class TaskManager:
 
     async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
         """Send a run order; to this gateway it is a call."""
+        durations = self._ahead.durations
+        if durations.seen(request.skill):
+            request = replace(request, expected_s=durations.of(request.skill, request.params))
         if gateway == self.plane.gateway:
             return await self._executor.run(request)
         return await self.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=self.config.run_timeout_s)
@@ -431,6 +434,10 @@ class TaskManager:
         for each in record.subtasks:
             if each.checkpoint_ns:
                 await remove_checkpoint(self.plane.dht, record.id, each.subtask.id)
+
+    def driver(self, task: str) -> Driver | None:
+        """Return the driver of a task that is coordinated here."""
+        return self._drivers.get(task)
 
     # --- questions --------------------------------------------------------------------------------------------
 

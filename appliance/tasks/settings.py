@@ -3,6 +3,7 @@
 from msgspec import Struct, field
 
 from appliance.tasks.detection import DetectionConfig
+from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.replan.settings import ReplanConfig
 
 
@@ -39,3 +40,5 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """When a run is taken for stuck or straggling."""
     replan: ReplanConfig = field(default_factory=ReplanConfig)
     """What may be done about a subtask that was given up."""
+    migration: MigrationConfig = field(default_factory=MigrationConfig)
+    """Moving runs in progress to other gateways."""

@@ -201,6 +201,10 @@ class _Child:
         del number, frame
         self.link.cancel()
 
+    def _asked_to_save(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self.link.saving_asked = True
+
     def warm_up(self) -> None:
         """Touch what the first lines of a run touch.
 
@@ -226,6 +230,7 @@ class _Child:
         kit, shared = self.kit, self.kit.shared
         self.link.attach(connection)
         signal.signal(signal.SIGTERM, self._asked_to_end)
+        signal.signal(signal.SIGUSR1, self._asked_to_save)
         frame: Frame
         try:
             limit_run(

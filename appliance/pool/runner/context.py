@@ -127,7 +127,16 @@ class Context(Surroundings):
         The number of calls made so far is kept with it: an attempt that goes on from here makes only those that come
         after, and they must keep their numbers, by which an effect that was done already is known.
         """
+        self._link.saving_asked = False
         self._tell("checkpoint", "data", data, MAX_CHECKPOINT, calls=self._link.calls)
+
+    def checkpoint_due(self) -> bool:
+        """Whether the appliance wants a checkpoint now, because it is about to move the run to another gateway.
+
+        A handler whose checkpoints cost something asks this between two steps, and saves when it is told to. It has
+        a second or two; a run that saves nothing by then goes on elsewhere from its last checkpoint.
+        """
+        return self._link.saving_asked
 
     def _tell(self, kind: str, key: str, value: dict[str, Any], most: int, **more: int) -> None:
         if not isinstance(value, dict):  # pyright: ignore[reportUnnecessaryIsInstance] - handlers are not checked

@@ -56,6 +56,8 @@ class Link:
         self._held = 0
         self._cancelled = False
         self._count = 0
+        self.saving_asked = False
+        """Whether a checkpoint is wanted now."""
 
     @property
     def calls(self) -> int:

@@ -107,6 +107,12 @@ class Run:
         else:
             self.kill_at = min(self.kill_at, time.monotonic() + grace_s)
 
+    def save(self) -> None:
+        """Tell the child that a checkpoint is wanted; one that has not begun yet does not hear it."""
+        if self.kill_at is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGUSR1)
+
     def kill(self) -> None:
         """End the child and everything it started."""
         for kill in (os.killpg, os.kill):

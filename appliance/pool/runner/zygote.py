@@ -67,6 +67,7 @@ class Zygote:
             os.set_blocking(end, False)
         signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, _woken)  # a handler of its own, or nothing would be written to `waker`
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # for the children, until they can heed it
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._asked_to_stop)
         # Under its name only when somebody listens: whoever sees it can connect.
@@ -167,6 +168,12 @@ class Zygote:
                 found = run is not None and run.id == frame.get("run")
                 if run is not None and found:
                     run.end(2 if frame.get("reason") == "deadline" else 1, float(frame.get("grace_s", GRACE_S)))
+                reply = {"ok": found}
+            case "save":
+                run = self._run
+                found = run is not None and run.id == frame.get("run")
+                if run is not None and found:
+                    run.save()
                 reply = {"ok": found}
             case "stop":
                 self._asked_to_stop(0, None)

@@ -66,3 +66,7 @@ class Context(Surroundings, Protocol):
     def checkpoint(self, data: dict[str, Any]) -> None:
         """Keep data from which a later attempt could go on."""
         ...
+
+    def checkpoint_due(self) -> bool:
+        """Whether the appliance wants a checkpoint now, since the run is about to be moved."""
+        ...
