@@ -119,7 +119,7 @@ class Gateway:
         )
         calls = Calls(self.plane, artifacts, on_wait=self._on_wait)
         state, links = await self._open_state()
-        remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=links)
+        self._remote = remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=links)
 
         async def on_call(call: Call) -> dict[str, object]:
             return await self._leaving.guard(call, calls)
@@ -360,6 +360,9 @@ class Gateway:
             draining=self._draining or self.executor.draining,
             drain=self.migration.draining.text,
             overloaded=self.migration.shedding.reason,
+            cores=os.cpu_count() or 0,
+            pool_memory_mb=self.config.pool.memory_mb,
+            searches=dict(self._remote.searches),
             limits_enforced=self.pool.limits_enforced,
             pool_problem=self.pool.problem or self.pool.squeeze,
             images=self._transfers.images() if self._transfers is not None else (),

@@ -411,6 +411,8 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Whose task it is: those who wait for a container are served in fair turns."""
     group: tuple[str, ...] = ()
     """Members of the task's group, to which it may be passed on; empty: any gateway."""
+    anew: bool = False
+    """Passed on, it may be started in a new container as well: whoever passes it on has no room for one."""
     moves: int = 0
     """How often the subtask was moved from one gateway to another before."""
     expected_s: float = 0.0
@@ -463,6 +465,8 @@ class RunEvent(Struct, frozen=True, kw_only=True, omit_defaults=True):
     note: str = ""
     result: dict[str, Any] | None = None
     failure: Failure | None = None
+    choice: Choice | None = None
+    """On the `progress` that tells of a run which was passed on while it waited: why it was."""
     startup_ms: float | None = None
     """On `started`: request received to first line of the handler, on the executing gateway's clock."""
     duration_ms: float | None = None
@@ -560,6 +564,14 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """While it drains: how far it is, and what the runs that are left wait for."""
     overloaded: str = ""
     """Why runs are moved away from it, or were lately: it is given none meanwhile. Empty when all is well."""
+    cores: int = 0
+    """Processor cores of the machine; 0: not told."""
+    pool_memory_mb: int = 0
+    """Memory that all its containers together may have; 0: not told."""
+    searches: dict[str, int] = field(default_factory=dict[str, int])
+    """How ready containers of others were looked for since it started: `asked` counts queries to other gateways,
+    `saved` those that were not needed because what was known was enough, `moved` runs that waited here and were
+    passed on."""
     limits_enforced: bool = True
     """False where the kernel's cgroups do not let rootless containers be limited."""
     pool_problem: str = ""

@@ -6,6 +6,7 @@ with it; a robot whose token goes is shown offline for a while and then forgotte
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import Callable
 
@@ -62,6 +63,8 @@ class Registry:
         self._gateway = gateway
         self._closers: list[Closer] = []
         self._heard: dict[str, int] = {}
+        self._heard_at: dict[str, float] = {}
+        """Gateway -> when anything was last heard of it, on this machine's monotonic clock."""
         self._asking: dict[str, asyncio.Task[None]] = {}
         self._status: GatewayStatus | None = None
         self._wanted: tuple[ContainerInfo, ...] | None = None
@@ -131,6 +134,13 @@ class Registry:
             robots=tuple(self.robots.values()),
         )
 
+    def age_s(self, gateway: str) -> float:
+        """Seconds since anything was heard of a gateway: 0 for this one, infinite for one that never told anything."""
+        if gateway == self._gateway:
+            return 0.0
+        at = self._heard_at.get(gateway)
+        return math.inf if at is None else time.monotonic() - at
+
     # --- others' facts ----------------------------------------------------------------------------------------
 
     async def wait_for_facts(self) -> None:
@@ -173,6 +183,7 @@ class Registry:
 
     def _count(self, gateway: str) -> None:
         self._heard[gateway] = self._heard.get(gateway, 0) + 1
+        self._heard_at[gateway] = time.monotonic()
 
     def _ask(self, gateway: str) -> None:
         """A member has come: ask for the facts it put before we listened."""
@@ -204,6 +215,7 @@ class Registry:
                 return
 
     def _take(self, gateway: str, facts: Facts) -> None:
+        self._heard_at[gateway] = time.monotonic()
         if facts.status is not None and facts.status.id == gateway:
             self.gateways[gateway] = facts.status
             self._tell("gateway")
@@ -227,6 +239,7 @@ class Registry:
         if task := self._asking.pop(gateway, None):
             task.cancel()
         self._heard.pop(gateway, None)
+        self._heard_at.pop(gateway, None)
         if self.gateways.pop(gateway, None) is not None:
             self._tell("gateway")
         if self.containers.pop(gateway, None) is not None:

@@ -265,6 +265,10 @@ class Keeper:
 
     # --- room -------------------------------------------------------------------------------------------------
 
+    def has_room(self, need: Need) -> bool:
+        """Whether there is room for one more container, if need be in place of an idle one."""
+        return self._room(self._size_mb(need), for_run=True) is not None
+
     def _size_mb(self, need: Need) -> int:
         return self._starter.size(need.image, need).memory_mb
 

@@ -281,6 +281,10 @@ class Pool:
         """Take a run out of the queue if it still waits there: `run` raises WithdrawnError. It has not begun."""
         return self._keeper.books.withdraw(run_id)
 
+    def has_room(self, need: Need) -> bool:
+        """Whether a container for a need could be started at once for a run that comes now: room, and no queue."""
+        return not self._keeper.books.queue and self._keeper.has_room(need)
+
     def expected_s(self, position: int) -> float | None:
         """In how many seconds the run at a place in the queue (from 1) may have a container; None: not known."""
         return self._keeper.expected_s(position)

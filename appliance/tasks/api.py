@@ -71,6 +71,12 @@ class RunStatus(Struct, frozen=True, kw_only=True):
     last: RunEvent | None = None
     silent_s: float | None = None
     """Seconds since the run's last sign of life, by that gateway's own clock; None when it does not run there."""
+    position: int = 0
+    """Its place among those who wait for a container there, from 1; 0: it does not."""
+    queue: int = 0
+    """How many wait there."""
+    expected_s: float | None = None
+    """In how many seconds it may have one; None: not known."""
 
 
 class ContainerList(Struct, frozen=True, kw_only=True):

@@ -7,7 +7,7 @@ coordinator that comes later can ask.
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import msgspec
@@ -17,7 +17,6 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PayloadError, PoolError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import (
-    Considered,
     Failure,
     Phase,
     PoolHint,
@@ -25,7 +24,6 @@ from appliance.model import (
     RunEvent,
     RunEventKind,
     RunRequest,
-    Way,
     encode,
 )
 from appliance.plane.keys import check_name
@@ -33,11 +31,14 @@ from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
 from appliance.pool.api import Hinted
 from appliance.pool.pool import Call, Pool
-from appliance.pool.selection import MOST_CONSIDERED, Decision
+from appliance.pool.selection import Decision
+from appliance.pool.turns import turn_of
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.checkpoints import Checkpoints
+from appliance.tasks.elsewhere import Elsewhere
+from appliance.tasks.passing import ORDER_S, PassedOn, Passing, explained, passed_on
 from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.telling import Telling
@@ -46,8 +47,6 @@ log = structlog.get_logger(__name__)
 
 REMOTE_TRIES = 3
 """Other gateways that are tried for one run before what is here has to do."""
-ORDER_S = 2.0
-"""How long another gateway may take to accept a run."""
 MAX_VERDICT = 80
 KEPT_RUNS = 2000
 """Last events kept of ended runs; a coordinator asks within seconds."""
@@ -78,6 +77,7 @@ class Executor:
         self._accepting: dict[str, asyncio.Task[RunAccepted]] = {}
         self._withdrawn: set[str] = set()
         """Orders being decided on that must not begin any more."""
+        self._passing = Passing(plane, pool, Elsewhere(plane, pool, remote, self._order_of))
         self._last: dict[str, RunEvent] = {}
         self._background: set[asyncio.Future[object]] = set()
         self._attempts: dict[tuple[str, str], int] = {}
@@ -114,7 +114,9 @@ class Executor:
                 log.warning("a kept run event cannot be read and is dropped", run=run_id, reason=str(error))
                 await self._plane.store.delete(key)
                 continue
-            if event.kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+            if event.gateway not in ("", self._plane.gateway):
+                self._passing.moved[run_id] = event.gateway
+            elif event.kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
                 event = replace(
                     event,
                     kind=RunEventKind.FAILED,
@@ -126,6 +128,7 @@ class Executor:
                 )
                 await self._plane.store.put(key, encode(event))
             self._remember(run_id, event)
+        self._passing.start()
 
     async def run(self, request: RunRequest) -> RunAccepted:
         """Accept one attempt and start it; the answer tells where, the events what becomes of it.
@@ -165,11 +168,12 @@ class Executor:
         decision = await self._decide(request)
         if isinstance(decision, RunAccepted):
             return decision
-        if request.hops and decision.phase is Phase.COLD:
-            raise RefusedError(f"{self._plane.gateway} has no ready container of {request.need.image} any more")
+        if request.hops and decision.phase is Phase.COLD and not (request.anew and self._pool.has_room(request.need)):
+            what = "room for a new container" if request.anew else f"ready container of {request.need.image}"
+            raise RefusedError(f"{self._plane.gateway} has no {what} any more")
         # Much may have happened while other gateways were asked.
         self._check(request)
-        phase = Phase.REMOTE_WARM if request.hops else decision.phase
+        phase = _seen_from_afar(decision.phase, request) or decision.phase
         accepted = RunAccepted(
             gateway=self._plane.gateway,
             container=decision.container or "",
@@ -203,15 +207,24 @@ class Executor:
         if (reserved := self.reserved(request)) is not None:
             return reserved
         remote, inputs = self._remote, bytes_by_gateway(request.inputs)
-        avoid = {**remote.left_out(), **dict.fromkeys(request.avoid, "an earlier attempt failed there")}
+        avoid = {
+            **remote.left_out(),
+            **self._outside(request),
+            **dict.fromkeys(request.avoid, "an earlier attempt failed there"),
+        }
         for left in reversed(range(REMOTE_TRIES + 1)):
             decision = await self._pool.select(
-                request.need, allow_remote=request.hops == 0 and left > 0, inputs=inputs, avoid=avoid
+                request.need,
+                allow_remote=request.hops == 0 and left > 0,
+                inputs=inputs,
+                avoid=avoid,
+                turn=turn_of(request),
             )
             if decision.phase is not Phase.REMOTE_WARM:
-                return _explained(decision, avoid)
+                return explained(decision, avoid)
             self._check(request)
             gateway = decision.gateway
+            remote.promise(gateway)
             try:
                 accepted = await self._plane.rpc.call(
                     gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
@@ -226,8 +239,14 @@ class Executor:
                 self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
             else:
                 remote.turned_out(gateway, good=True)
-                return _passed_on(accepted, _explained(decision, avoid))
+                return passed_on(accepted, explained(decision, avoid))
         raise PoolError("a selection without other gateways chose one")
+
+    def _outside(self, request: RunRequest) -> dict[str, str]:
+        """Gateways that the run may not be passed on to."""
+        if not request.group:
+            return {}
+        return {each: "outside the task's group" for each in self._plane.members() if each not in request.group}
 
     def _check(self, request: RunRequest) -> None:
         """Refuse what must not begin (any more)."""
@@ -257,7 +276,7 @@ class Executor:
 
         begun = asyncio.create_task(self._keep(run_id, self._last[run_id]))
         try:
-            final = await self._pool.run(request, decision, tell)
+            final = await self._passing.run(request, decision, tell, since=received_ns / 1e9, check=self._check)
         except SwiftbotError as error:
             final = _failed(
                 request, Failure(code=error.code, message=error.message, remedy=error.remedy, retryable=True)
@@ -267,6 +286,14 @@ class Executor:
             final = _failed(
                 request, Failure(code="internal", message=f"{type(error).__name__}: {error}", retryable=True)
             )
+        if isinstance(final, PassedOn):
+            self._remember(run_id, final.event)
+            self.telling.tell(final.event)
+            await begun
+            await self._keep(run_id, final.event)
+            if run_id in self._withdrawn:
+                await self._passing.ask(run_id, "run_cancel")
+            return
         final = replace(final, gateway=self._plane.gateway, phase=_seen_from_afar(final.phase, request))
         final = tidy(final, max_result_bytes=self._config.max_result_bytes)
         self._remember(run_id, final)
@@ -312,6 +339,7 @@ class Executor:
     def _forget(self, run_id: str) -> None:
         gone = self._last.pop(run_id)
         self._accepted.pop(run_id, None)
+        self._passing.moved.pop(run_id, None)
         self._attempts.pop((gone.task, gone.subtask), None)
         self._later(self._plane.store.delete(f"run/{run_id}"))
 
@@ -322,7 +350,7 @@ class Executor:
                 self._withdrawn.add(run_id)
         for run_id in [each for each in self._running if each.startswith(f"{request.task}/{request.subtask}/")]:
             if run_id != request.run_id:
-                await self._pool.cancel(run_id)
+                await self._end(run_id)
 
     def _on_record(self, message: Message) -> None:
         """End runs whose attempt the record has left behind; forget the runs of a task that has ended."""
@@ -348,7 +376,7 @@ class Executor:
             outdated = event.attempt < attempts.get(event.subtask, 0)
             if run_id in self._running:
                 if outdated or record.state.final:
-                    self._later(self._pool.cancel(run_id))
+                    self._later(self._end(run_id))
             elif record.state.final:
                 self._forget(run_id)
 
@@ -365,6 +393,7 @@ class Executor:
     def _ended(self, run_id: str, done: "asyncio.Task[None]") -> None:
         self._running.pop(run_id, None)
         self._here.pop(run_id, None)
+        self._withdrawn.discard(run_id)
         if not done.cancelled() and (error := done.exception()) is not None:
             # The coordinator asks after the run, sees that it has ended with nothing, and repeats it.
             log.error("run was not brought to its end", run=run_id, exc_info=error)
@@ -375,18 +404,40 @@ class Executor:
         return await self._pool.verbs.hint(hint)
 
     async def status(self, ask: RunAsk) -> RunStatus:
-        """Tell what is known of a run."""
+        """Tell what is known of a run; one that was passed on is asked after where it is."""
+        if ask.run_id in self._passing.moved:
+            return await self._passing.ask(ask.run_id, "run_status")
         running = ask.run_id in self._running or ask.run_id in self._accepting
-        silent_s = self.telling.silent_s(ask.task, ask.subtask, ask.attempt) if running else None
-        return RunStatus(running=running, last=self._last.get(ask.run_id), silent_s=silent_s)
+        waiting = [turn.id for turn, _ in self._pool.waiting()] if running else []
+        position = waiting.index(ask.run_id) + 1 if ask.run_id in waiting else 0
+        return RunStatus(
+            running=running,
+            last=self._last.get(ask.run_id),
+            silent_s=self.telling.silent_s(ask.task, ask.subtask, ask.attempt) if running and not position else None,
+            position=position,
+            queue=len(waiting) if position else 0,
+            expected_s=self._pool.expected_s(position) if position else None,
+        )
+
+    async def _end(self, run_id: str) -> None:
+        """Have a run in progress end, also one that is on its way to another gateway."""
+        if run_id in self._passing.moving:
+            self._withdrawn.add(run_id)
+        await self._pool.cancel(run_id)
 
     async def cancel(self, ask: RunAsk) -> RunStatus:
         """Ask a run to end; its final event follows."""
         if ask.run_id in self._accepting:
             self._withdrawn.add(ask.run_id)
+        if ask.run_id in self._passing.moved:
+            return await self._passing.ask(ask.run_id, "run_cancel")
         if ask.run_id in self._running:
-            await self._pool.cancel(ask.run_id)
+            await self._end(ask.run_id)
         return await self.status(ask)
+
+    def _order_of(self, run_id: str) -> RunRequest | None:
+        here = self._here.get(run_id)
+        return here.request if here is not None else None
 
     def check(self, request: RunRequest) -> None:
         """Raise RefusedError when an order could not begin here: draining, or outdated."""
@@ -421,41 +472,16 @@ class Executor:
             if self._running:
                 await asyncio.wait(list(self._running.values()), timeout=deadline_s)
             for run_id in list(self._running):
-                await self._pool.cancel(run_id)
+                await self._end(run_id)
             if self._running:
                 await asyncio.wait(list(self._running.values()), timeout=5.0)
         finally:
             # Until here records are heard: a task that ends or moves on elsewhere ends its runs here.
+            self._passing.stop()
             if self._records is not None:
                 self._records.close()
             if self._background:
                 await asyncio.wait(list(self._background), timeout=2.0)
-
-
-def _explained(decision: Decision, avoid: Mapping[str, str]) -> Decision:
-    """Have the choice name the gateways that were left out, also those that selection did not hear of again."""
-    choice = decision.choice
-    if choice is None or not avoid:
-        return decision
-    told = {each.gateway for each in choice.considered}
-    missing = tuple(
-        Considered(gateway=gateway, way=Way.RUN_THERE, verdict=reason)
-        for gateway, reason in avoid.items()
-        if gateway not in told
-    )
-    considered = (*choice.considered[: MOST_CONSIDERED - len(missing)], *missing)
-    return replace(decision, choice=replace(choice, considered=considered[:MOST_CONSIDERED]))
-
-
-def _passed_on(accepted: RunAccepted, decision: Decision) -> RunAccepted:
-    """The other gateway's answer with the reasons of the one that chose it; it picks the container itself."""
-    choice = decision.choice
-    if choice is None:
-        return accepted
-    choice = replace(choice, gateway=accepted.gateway, container=accepted.container)
-    if accepted.choice is not None and accepted.choice.way is Way.BRING_HERE:
-        choice = replace(choice, why=f"{choice.why}; there {accepted.choice.why}")
-    return replace(accepted, why=decision.why, choice=choice)
 
 
 def _number(run_id: str) -> int:

@@ -81,6 +81,8 @@ class Hearing:
                 startup_ms = (time.monotonic_ns() - ready_ns) / 1e6 if ready_ns else event.startup_ms
                 keeper.take(keeper.transition(TransitionKind.STARTED, startup_ms=startup_ms, choice=choice, **common))
             case RunEventKind.PROGRESS:
+                if event.choice is not None:
+                    self._orders.passed_on(event.subtask, event.attempt, event.choice)
                 keeper.take(
                     keeper.transition(TransitionKind.PROGRESS, progress=event.progress, note=event.note, **common),
                     durable=False,

@@ -133,6 +133,12 @@ class Orders:
         accepted = self._accepted.get((subtask, attempt))
         return accepted.choice if accepted is not None else None
 
+    def passed_on(self, subtask: str, attempt: int, choice: Choice) -> None:
+        """Note that a run was passed on while it waited, and why."""
+        accepted = self._accepted.get((subtask, attempt))
+        if accepted is not None:
+            self._accepted[subtask, attempt] = replace(accepted, gateway=choice.gateway, choice=choice)
+
     def cancel(self, target: SubtaskRecord, task: str) -> None:
         """Have a run end; its final event follows."""
         self._start(self.ask(target, task, "run_cancel"))

@@ -1,14 +1,18 @@
 """Phase 2 of container selection, finding a ready container elsewhere (paper, Algorithm 1, distributed search).
 
-The k successors of hash(image) are asked; each answers with the ready containers it knows of, its own and those
-it has heard of. What selection must know beside them comes from here too: the measured round trip to each gateway
-(a moving average), what moving bytes costs, and where the newest state of a volume is. A gateway whose offers turn
-out to be nothing, several times in a row, is left out for a while: it is out of date, or it lies.
+What the registry knows comes first: gateways push what changes, so a container that it knows to be ready, of a gateway
+that was heard of lately, is as good as an answer and costs nothing. Only when it knows of none that can be had are the
+k successors of hash(image) asked, and of those the ones of which nothing was heard lately; each answers with the ready
+containers it knows of, its own and those it has heard of. What selection must know beside them comes from here too:
+the measured round trip to each gateway (a moving average), what moving bytes costs, and where the newest state of a
+volume is. A gateway whose offers turn out to be nothing, several times in a row, is left out for a while: it is out of
+date, or it lies.
 """
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from msgspec import Struct
@@ -26,8 +30,15 @@ UNKNOWN_ROUND_TRIP_MS = 5.0
 BRING_MS = 40.0
 """What bringing a volume costs however small it is: asking for it, the snapshot there, the swap here (measured with a
 file of 14 bytes on a loaded machine: 50 to 80 ms to the first line of the handler)."""
+FRESH_S = 10.0
+"""What was heard of a gateway within this time is believed without asking: it tells its status every few seconds and
+every change of a container at once, so silence for longer means that something is lost on the way."""
+PROMISED_S = 0.25
+"""For how long a container to which a run was sent is not counted on any more: by then its gateway has said that it is
+busy (changes are told after 20 ms), or that it is not."""
 EMPTY_OFFERS = 3
 """Offers in a row that were nothing, after which a gateway is left out; one or two are lost races."""
+MOST_PROMISED = 64
 LEFT_OUT_S = 10.0
 """For how long at most: it doubles with each further offer that is nothing, and one that is good ends it."""
 FIRST_LEFT_OUT_S = 0.25
@@ -81,13 +92,23 @@ class RemoteContainers:
         self._links = links
         self._round_trip_ms: dict[str, float] = {}
         self._trust: dict[str, _Trust] = {}
+        self._promised: dict[str, list[float]] = {}
+        """Gateway -> until when each of the runs sent to it counts as having one of its ready containers."""
+        self._doubted: dict[str, float] = {}
+        """Gateway -> until when what is known of its containers is not believed: it had none when it was asked."""
+        self.searches: Counter[str] = Counter()
+        """For GatewayStatus.searches."""
         plane.on_member_lost.append(self._forget)
 
     async def find(self, need: Need) -> list[Candidate]:
         """Containers on other gateways that could serve a need, in any state, each with its round trip."""
         here = self._plane.gateway
-        asked = [each for each in self._plane.ring.successors(f"image/{need.image}", self._successors) if each != here]
+        near = [each for each in self._plane.ring.successors(f"image/{need.image}", self._successors) if each != here]
         found = {(each.gateway, each.id): each for each in self._known(need)}
+        asked = [] if self.ready(need) else [each for each in near if not self._is_fresh(each)]
+        self.searches["saved"] += len(near) - len(asked)
+        self.searches["asked"] += len(asked)
+        taken = {(each.gateway, each.id) for each in self._promised_ones(found.values())}
         answers = await asyncio.gather(*(self._ask(each, need) for each in asked))
         for gateway, containers in zip(asked, answers, strict=True):
             if containers is None:
@@ -108,9 +129,50 @@ class RemoteContainers:
         members = self._plane.members()
         return [
             Candidate(container=each, round_trip_ms=self._round_trip_ms.get(each.gateway, UNKNOWN_ROUND_TRIP_MS))
-            for each in found.values()
-            if each.gateway != here and each.gateway in members
+            for key, each in found.items()
+            if each.gateway != here and each.gateway in members and key not in taken
         ]
+
+    def ready(self, need: Need) -> list[ContainerInfo]:
+        """Containers of other gateways that are known to be ready for a need, and that no run was just sent to."""
+        members, here = self._plane.members(), self._plane.gateway
+        known = self._known(need)
+        taken = {(each.gateway, each.id) for each in self._promised_ones(known)}
+        left_out = self.left_out()
+        return [
+            each
+            for each in known
+            if each.state is ContainerState.READY
+            and each.gateway != here
+            and each.gateway in members
+            and each.gateway not in left_out
+            and (each.gateway, each.id) not in taken
+            and self._is_fresh(each.gateway)
+        ]
+
+    def _is_fresh(self, gateway: str) -> bool:
+        if self._doubted.get(gateway, 0.0) > time.monotonic():
+            return False
+        return self._plane.registry.age_s(gateway) <= FRESH_S
+
+    def _promised_ones(self, containers: Iterable[ContainerInfo]) -> list[ContainerInfo]:
+        """As many ready containers of each gateway as runs were just sent to it; it picks them itself."""
+        now = time.monotonic()
+        ready: dict[str, list[ContainerInfo]] = {}
+        for each in containers:
+            if each.state is ContainerState.READY and each.gateway in self._promised:
+                ready.setdefault(each.gateway, []).append(each)
+        found: list[ContainerInfo] = []
+        for gateway, held in ready.items():
+            held.sort(key=lambda each: each.id)
+            found += held[: sum(until > now for until in self._promised[gateway])]
+        return found
+
+    def promise(self, gateway: str) -> None:
+        """Note that a run is being sent to a gateway: one of its ready containers is spoken for."""
+        now = time.monotonic()
+        sent = [until for until in self._promised.get(gateway, ()) if until > now]
+        self._promised[gateway] = [*sent[-MOST_PROMISED:], now + PROMISED_S]
 
     async def _ask(self, gateway: str, need: Need) -> tuple[ContainerInfo, ...] | None:
         began = time.monotonic()
@@ -180,6 +242,7 @@ class RemoteContainers:
         if good:
             self._trust.pop(gateway, None)
             return
+        self._doubted[gateway] = time.monotonic() + PROMISED_S
         trust = self._trust.setdefault(gateway, _Trust())
         trust.empty += 1
         if trust.empty >= EMPTY_OFFERS:
@@ -187,5 +250,7 @@ class RemoteContainers:
             trust.until = now() + min(LEFT_OUT_S, FIRST_LEFT_OUT_S * 2**doublings)
 
     def _forget(self, gateway: str) -> None:
+        self._promised.pop(gateway, None)
+        self._doubted.pop(gateway, None)
         self._round_trip_ms.pop(gateway, None)
         self._trust.pop(gateway, None)

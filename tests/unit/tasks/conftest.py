@@ -6,6 +6,7 @@ records that move on, gateways that vanish, without processes, sockets or contai
 """
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -33,7 +34,9 @@ from appliance.model import (
 from appliance.plane.dht import Record
 from appliance.plane.keys import Keys
 from appliance.plane.session import Message
+from appliance.pool.books import WithdrawnError
 from appliance.pool.selection import Decision
+from appliance.pool.turns import Turn
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine
 from appliance.tasks.checkpoints import Checkpoint
@@ -206,6 +209,11 @@ class FakeRegistry:
         self.containers: dict[str, Any] = {}
         self.robots: dict[str, Any] = {}
         self.on_change: list[Callable[[str], None]] = []
+        self.ages: dict[str, float] = {}
+
+    def age_s(self, gateway: str) -> float:
+        """Return what the test says; by default nothing was ever heard."""
+        return self.ages.get(gateway, math.inf)
 
 
 class FakeRing:
@@ -260,9 +268,18 @@ class FakePool:
         self.cancelled: list[str] = []
         self.tells: dict[str, Callable[[RunEvent], None]] = {}
         self.runs: dict[str, asyncio.Future[RunEvent]] = {}
+        self.line: list[tuple[Turn, Need]] = []
+        self.full = False
+        self.room = True
 
     async def select(
-        self, need: Need, *, allow_remote: bool, inputs: Mapping[str, int], avoid: Mapping[str, str]
+        self,
+        need: Need,
+        *,
+        allow_remote: bool,
+        inputs: Mapping[str, int],
+        avoid: Mapping[str, str],
+        turn: Turn | None = None,
     ) -> Decision:
         """Return the prepared decision."""
         self.asked.append((allow_remote, dict(inputs), dict(avoid)))
@@ -270,8 +287,49 @@ class FakePool:
             await self.gate.wait()
         return self.decisions.pop(0) if self.decisions else self.decision
 
-    async def run(self, request: RunRequest, decision: Decision, on_event: Callable[[RunEvent], None]) -> RunEvent:
+    def waiting(self) -> list[tuple[Turn, Need]]:
+        """Return those whom the test has wait."""
+        return self.line
+
+    @property
+    def queue(self) -> int:
+        """How many wait."""
+        return len(self.line)
+
+    def withdraw(self, run_id: str) -> bool:
+        """Take a run out of the line."""
+        before = len(self.line)
+        self.line = [each for each in self.line if each[0].id != run_id]
+        if len(self.line) == before:
+            return False
+        self.runs[run_id].set_exception(WithdrawnError("withdrawn"))
+        return True
+
+    def expected_s(self, position: int) -> float | None:
+        """Return a second for each place."""
+        return float(position)
+
+    def cold_ms(self, image: str) -> float:
+        """Return what a cold start takes."""
+        return 500.0
+
+    def has_room(self, need: Need) -> bool:
+        """Return what the test says."""
+        return self.room
+
+    async def run(
+        self,
+        request: RunRequest,
+        decision: Decision,
+        on_event: Callable[[RunEvent], None],
+        *,
+        turn: Turn | None = None,
+    ) -> RunEvent:
         """Wait for the test."""
+        if self.full and turn is not None:
+            self.runs[request.run_id] = asyncio.get_running_loop().create_future()
+            self.line.append((turn, request.need))
+            return await self.runs[request.run_id]
         self.tells[request.run_id] = on_event
         future = self.runs[request.run_id] = asyncio.get_running_loop().create_future()
         on_event(event(request, RunEventKind.STARTED, startup_ms=1.0))

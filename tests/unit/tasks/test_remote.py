@@ -117,3 +117,34 @@ async def test_empty_offers_leave_a_gateway_out_for_a_while(remote: RemoteContai
     for callback in plane.on_member_lost:
         callback("gw-2")
     assert remote.left_out(lambda: now) == {}
+
+
+async def test_what_is_known_saves_asking(remote: RemoteContainers, plane: Any) -> None:
+    """A ready container of a gateway heard of lately is enough; without one, only those not heard of are asked."""
+    answers(plane, gw_2=(), gw_3=(container("gw-3", "new"),))
+    know(plane, container("gw-4", "ready"), container("gw-2", "works", BUSY))
+    plane.registry.ages = {"gw-4": 0.5, "gw-2": 0.5}
+    assert await found(remote) == {"ready": READY, "works": BUSY}
+    assert not plane.rpc.calls
+    assert remote.searches == {"saved": 2, "asked": 0}
+    know(plane, container("gw-4", "ready", BUSY))
+    assert await found(remote) == {"ready": BUSY, "works": BUSY, "new": READY}
+    assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-3"]
+    assert remote.searches == {"saved": 3, "asked": 1}
+
+
+async def test_a_container_that_a_run_was_just_sent_to_is_not_offered_to_the_next(
+    remote: RemoteContainers, plane: Any
+) -> None:
+    """As many as runs were sent there are left out, until its gateway can have told; one that had none is asked."""
+    know(plane, container("gw-2", "a"), container("gw-2", "b"))
+    answers(plane, gw_2=(container("gw-2", "b"),), gw_3=())
+    plane.registry.ages = {"gw-2": 0.1, "gw-3": 0.1}
+    assert {each.id for each in remote.ready(NEED)} == {"a", "b"}
+    remote.promise("gw-2")
+    assert {each.id for each in remote.ready(NEED)} == {"b"}
+    assert await found(remote) == {"b": READY}
+    remote.turned_out("gw-2", good=False)
+    assert remote.ready(NEED) == []
+    assert set(await found(remote)) == {"b"}
+    assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-2"]
