@@ -137,14 +137,16 @@ class Overload:
             (config.queue_high and load.queue) or (config.cpu_high and load.cpu >= config.cpu_low) or load.squeeze
         )
 
-    def choose(self, load: Load, runs: Sequence[Candidate], room: Room, *, under_way: int, now: float) -> list[str]:
+    def choose(
+        self, load: Load, runs: Sequence[Candidate], room: Room, *, under_way: Sequence[Candidate], now: float
+    ) -> list[str]:
         """Return the runs to move now, cheapest first; none while it is not overloaded or must wait.
 
         Args:
             load: what the gateway sees of itself.
             runs: all runs here but those being moved.
             room: what is known of the others.
-            under_way: moves away from here that have not ended.
+            under_way: runs that are being moved away; those that wait are still counted in the queue.
             now: monotonic seconds.
         """
         config = self._config
@@ -155,19 +157,19 @@ class Overload:
         able = sorted((each for each in runs if self._may(each)), key=lambda each: (cost_s(each), each.id))
         fair = config.fleet_moves_per_s / max(1, room.overloaded)
         self._bucket.limit(min(config.moves_per_s, fair))
-        most = min(room.places, config.at_once - under_way, self._bucket.left(now))
-        chosen = able[: max(0, min(most, self._wanted(load, able)))]
+        most = min(room.places, config.at_once - len(under_way), self._bucket.left(now))
+        chosen = able[: max(0, min(most, self._wanted(load, able, under_way)))]
         for _ in chosen:
             self._bucket.take(now)
         return [each.id for each in chosen]
 
-    def _wanted(self, load: Load, able: Sequence[Candidate]) -> int:
-        """How many must go to bring the gateway back between its marks."""
+    def _wanted(self, load: Load, able: Sequence[Candidate], under_way: Sequence[Candidate]) -> int:
+        """How many more must go to bring the gateway back between its marks."""
         config = self._config
-        wanted = load.queue if config.queue_high else 0
+        wanted = load.queue - sum(not each.began for each in under_way) if config.queue_high else 0
         if config.cpu_high and load.cpu >= config.cpu_high:
             excess = (load.cpu - (config.cpu_high + config.cpu_low) / 2) * load.processors
-            gained = 0.0
+            gained = sum(each.cpu for each in under_way)
             for number, each in enumerate(able, 1):
                 gained += each.cpu
                 if gained >= excess:
@@ -175,7 +177,7 @@ class Overload:
                     break
             else:
                 wanted = max(wanted, len(able))
-        return max(wanted, 1 if load.squeeze else 0)
+        return max(wanted, 1 if load.squeeze and not under_way else 0)
 
     def _may(self, run: Candidate) -> bool:
         config = self._config

@@ -80,12 +80,15 @@ class Shedding:
             self._on_change()
         if not reason or self._executor.draining:
             return
-        here = {run: each for run, each in self._executor.here().items() if run not in self._moving}
-        room = self._room()
+        here = self._executor.here()
+        runs = {run: self._candidate(run, each, now) for run, each in here.items()}
         chosen = self.overload.choose(
-            load, [self._candidate(run, each, now) for run, each in here.items()], room,
-            under_way=len(self._moving), now=now,
-        )  # fmt: skip
+            load,
+            [each for run, each in runs.items() if run not in self._moving],
+            self._room(),
+            under_way=[each for run, each in runs.items() if run in self._moving],
+            now=now,
+        )
         if not chosen:
             return
         self._requesting.put([here[run] for run in chosen], Reason.OVERLOAD, reason)
