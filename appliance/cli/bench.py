@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+import sys
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -180,15 +181,33 @@ def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: in
     return 0 if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else 1
 
 
+def _faults(named: str) -> tuple[str, ...]:
+    """Return the faults of the network that are named; with any, this process is run again inside a namespace."""
+    from appliance.bench.net.faults import FAULTS
+    from appliance.bench.net.space import enter
+    from appliance.errors import ConfigError
+
+    if not named:
+        return ()
+    faults = FAULTS if named == "all" else tuple(each.strip() for each in named.split(","))
+    if unknown := [each for each in faults if each not in FAULTS]:
+        raise ConfigError(f"there is no fault {unknown[0][:40]!r}", remedy=f"there are: {', '.join(FAULTS)}")
+    enter(sys.argv[1:])
+    return faults
+
+
 @bench_app.command
 def chaos(
     *,
     minutes: float = 5.0,
     tasks: int = 200,
     gateways: int = 8,
-    every_s: float = 4.0,
+    every_s: float | None = None,
     down_at_once: int = 2,
     freezes: float = 0.2,
+    faults: str = "",
+    fault_s: float = 0.0,
+    rest_s: float = 15.0,
     seed: int = 1,
     keep: str = "",
     as_json: Json = False,
@@ -199,20 +218,25 @@ def chaos(
     with the MCAP log and the ledger is kept and named.
 
     Args:
-        minutes: How long gateways go down.
+        minutes: How long gateways go down; with faults of the network their times count.
         tasks: Tasks handed in over that time.
         gateways: Gateways, each a process.
-        every_s: Mean time between outages, seconds.
+        every_s: Mean time between outages, seconds, 0 for none; by default 4, and none with faults of the network.
         down_at_once: Most that are down at the same time; up to 2, of 3 replicas one is always there.
         freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
-        seed: Of tasks and outages.
+        faults: Faults of the network, one after the other: some of loss,delay,reorder,oneway,partition, or all.
+        fault_s: How long each lasts; 0: 30 to 60 s.
+        rest_s: How long the network is good before each.
+        seed: Of tasks, outages and faults.
         keep: Folder to keep logs and ledger in.
     """
     from appliance.bench.chaos.run import Options, run
 
+    named = _faults(faults)
     options = Options(
-        gateways=gateways, tasks=tasks, seconds=minutes * 60, every_s=every_s, down_at_once=down_at_once,
-        freezes=freezes, seed=seed, keep=keep,
+        gateways=gateways, tasks=tasks, seconds=minutes * 60, down_at_once=down_at_once, freezes=freezes, seed=seed,
+        every_s=every_s if every_s is not None else 0.0 if named else 4.0, faults=named, fault_s=fault_s,
+        rest_s=rest_s, keep=keep,
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)
@@ -230,6 +254,9 @@ def history(
     every_s: float = 3.0,
     freezes: float = 0.4,
     down_at_once: int = 2,
+    faults: str = "",
+    fault_s: float = 0.0,
+    rest_s: float = 15.0,
     seed: int = 1,
     keep: str = "",
     as_json: Json = False,
@@ -240,22 +267,26 @@ def history(
     and that no acknowledged write is forgotten. Ends with 1 when it is not so; the recorded history is kept and named.
 
     Args:
-        seconds: How long.
+        seconds: How long; with faults of the network their times count.
         gateways: Gateways, each a process with nothing but its plane.
         clients: Clients, each linked to one gateway.
         keys: Keys they share.
         quorum: Ask for a quorum.
-        every_s: Mean time between outages, seconds.
+        every_s: Mean time between outages, seconds; 0 for none.
         freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
         down_at_once: Most that are down at the same time.
-        seed: Of clients and outages.
+        faults: Faults of the network, one after the other: some of loss,delay,reorder,oneway,partition, or all.
+        fault_s: How long each lasts; 0: 30 to 60 s.
+        rest_s: How long the network is good before each.
+        seed: Of clients, outages and faults.
         keep: Folder to keep the gateways' data and logs in.
     """
     from appliance.bench.history.run import Options, run
 
     options = Options(
         seconds=seconds, gateways=gateways, clients=clients, keys=keys, quorum=quorum, every_s=every_s,
-        freezes=freezes, down_at_once=down_at_once, seed=seed, keep=keep,
+        freezes=freezes, down_at_once=down_at_once, faults=_faults(faults), fault_s=fault_s, rest_s=rest_s, seed=seed,
+        keep=keep,
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)

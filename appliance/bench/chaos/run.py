@@ -11,7 +11,7 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Coroutine, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from appliance.bench.chaos import account, plan
 from appliance.bench.chaos.account import Down, Follower, Submitted
 from appliance.bench.chaos.arena import Arena, Progress, Site, loopback
 from appliance.bench.chaos.ledger import LedgerFile, LedgerRobot
+from appliance.bench.net import space
+from appliance.bench.net.faults import REST_S, phases
 from appliance.bench.pooled import fleet_name, write_skill
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, SwiftbotError
@@ -85,7 +87,7 @@ class Options(Struct, frozen=True, kw_only=True):
     seconds: float = 300.0
     """How long gateways go down; tasks are handed in over the first 80 % of it."""
     every_s: float = 4.0
-    """Mean time between outages."""
+    """Mean time between outages; 0: there are none."""
     freezes: float = 0.2
     """Share of outages in which the gateway is only stopped and goes on later."""
     down_at_once: int = 2
@@ -95,6 +97,12 @@ class Options(Struct, frozen=True, kw_only=True):
     containers: int = 1
     """Kept ready by each gateway."""
     seed: int = 1
+    faults: tuple[str, ...] = ()
+    """Faults of the network that it goes through, one after the other (`net.faults`); each gateway has a network
+    namespace of its own then, and the process must be inside one (`net.space.enter`)."""
+    fault_s: float = 0.0
+    """How long each lasts; 0: as a full run has it."""
+    rest_s: float = REST_S
     keep: str = ""
     """Folder for logs of the run; empty: a temporary one, kept only when an invariant is broken."""
 
@@ -205,7 +213,11 @@ class Trial:
 
 @asynccontextmanager
 async def trial(
-    options: Options, *, progress: Progress, sites: dict[str, Site] | None = None, clients: Sequence[str] = ()
+    options: Options,
+    *,
+    progress: Progress,
+    sites: dict[str, Site] | None = None,
+    sides: Sequence[Sequence[str]] = (),
 ) -> AsyncGenerator[Trial]:
     """A fleet, its ledger robots and a client; all gone afterwards but for the folder named in `keep`.
 
@@ -213,7 +225,7 @@ async def trial(
         options: what it is made of.
         progress: told what happens.
         sites: where the gateways run; by default on the loopback.
-        clients: endpoints that client and robots link to; by default all.
+        sides: of a partition to come: robots link to gateways of one side only, in turn.
     """
     folder, skills = _folder(options.keep)
     arena = Arena(
@@ -228,14 +240,15 @@ async def trial(
         stack.callback(file.close)
         stack.push_async_callback(arena.stop, progress=progress)
         await arena.start_all(progress=progress, ready=options.containers)
-        connect = tuple(clients) or arena.endpoints
-        client = await stack.enter_async_context(await arena.client(connect))
+        client = await stack.enter_async_context(await arena.client())
         config = PlaneConfig(mode="peer", connect=arena.endpoints)
         observer = await Session.open(config, arena.fleet)
         stack.push_async_callback(observer.close)
         it = Trial(options, arena, client, observer, file)
-        for number in range(ROBOTS):
-            robot = await LedgerRobot.start(f"ledger_{number + 1}", file, fleet=arena.fleet, connect=connect)
+        for number, name in enumerate(robots()):
+            side = sides[number % len(sides)] if sides else arena.names
+            connect = tuple(arena.sites[each].endpoint for each in side)
+            robot = await LedgerRobot.start(name, file, fleet=arena.fleet, connect=connect)
             stack.push_async_callback(robot.close)
         yield it
 
@@ -265,27 +278,62 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
     Raises:
         DeadlineError, PrerequisiteError: the fleet did not start.
     """
-    wanted = plan.tasks(
-        options.tasks, seconds=options.seconds * 0.8, robots=robots(), prefix=f"c{options.seed}-", seed=options.seed
-    )
+    if options.faults:
+        return await _on_a_bad_wire(options, progress=progress)
     async with trial(options, progress=progress) as it:
+        result = await _run(it, _nothing(), seconds=options.seconds, progress=progress)
+        folder = it.arena.directory
+    return keep(result, folder, asked=bool(options.keep))
+
+
+async def _on_a_bad_wire(options: Options, *, progress: Progress) -> dict[str, Any]:
+    names = tuple(f"gw-{number + 1}" for number in range(options.gateways))
+    planned = phases(options.faults, names, fault_s=options.fault_s, rest_s=options.rest_s, seed=options.seed)
+    sides = next((phase.sides for phase in planned if phase.sides), ())
+    seconds = planned[-1].until_s
+    async with (
+        space.net(names, seed=options.seed) as wire,
+        trial(options, progress=progress, sites=wire.sites, sides=sides) as it,
+    ):
+        faults = space.disturb(wire, planned, time.monotonic(), progress)
+        result = await _run(it, faults, seconds=seconds, progress=progress)
+        folder = it.arena.directory
+    result["faults"] = {each.name: each.until_s - each.at_s for each in planned}
+    result["sides"] = sides
+    return keep(result, folder, asked=bool(options.keep))
+
+
+async def _nothing() -> dict[str, int]:
+    return {}
+
+
+async def _run(
+    it: Trial, faults: Coroutine[Any, Any, dict[str, int]], *, seconds: float, progress: Progress
+) -> dict[str, Any]:
+    options = it.options
+    wanted = plan.tasks(
+        options.tasks, seconds=seconds * 0.8, robots=robots(), prefix=f"c{options.seed}-", seed=options.seed
+    )
+    planned = ()
+    if options.every_s > 0:
         planned = plan.outages(
             it.arena.names,
-            seconds=options.seconds,
+            seconds=seconds,
             most=options.down_at_once,
             every_s=options.every_s,
             freezes=options.freezes,
             seed=options.seed,
         )
-        progress(f"{len(wanted)} tasks over {options.seconds * 0.8:.0f} s, {len(planned)} outages")
-        began = time.monotonic()
-        async with asyncio.TaskGroup() as group:
-            group.create_task(it.submit(wanted, began))
-            group.create_task(it.outages(planned, began, progress))
-        result = await judge(it, wanted, progress=progress)
-        folder = it.arena.directory
-    result |= {"gateways": options.gateways, "seconds": options.seconds, "seed": options.seed}
-    return keep(result, folder, asked=bool(options.keep))
+    progress(f"{len(wanted)} tasks over {seconds * 0.8:.0f} s, {len(planned)} outages")
+    began = time.monotonic()
+    async with asyncio.TaskGroup() as group:
+        group.create_task(it.submit(wanted, began))
+        group.create_task(it.outages(planned, began, progress))
+        disturbing = group.create_task(faults)
+    result = await judge(it, wanted, progress=progress)
+    if frames := disturbing.result():
+        result["frames"] = frames
+    return result | {"gateways": options.gateways, "seconds": round(seconds, 1), "seed": options.seed}
 
 
 async def judge(it: Trial, wanted: Sequence[plan.Wanted], *, progress: Progress) -> dict[str, Any]:

@@ -24,6 +24,8 @@ from appliance.bench.chaos.arena import Arena, Progress, Site, loopback
 from appliance.bench.chaos.plan import Outage, outages
 from appliance.bench.history import convergence, linearizable
 from appliance.bench.history.clients import Client, History
+from appliance.bench.net import space
+from appliance.bench.net.faults import REST_S, Phase, phases
 from appliance.bench.pooled import fleet_name
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError
@@ -50,7 +52,12 @@ class Options(Struct, frozen=True, kw_only=True):
     freezes: float = 0.4
     down_at_once: int = 2
     pause_s: float = 0.02
+    """Mean pause of a client between two operations."""
     seed: int = 1
+    faults: tuple[str, ...] = ()
+    """Faults of the network, one after the other; see `chaos.run.Options`."""
+    fault_s: float = 0.0
+    rest_s: float = REST_S
     keep: str = ""
 
 
@@ -211,26 +218,47 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
     Raises:
         DeadlineError: the fleet was not whole again a minute after the last fault.
     """
-    async with planes(options, progress=progress) as arena, contextlib.AsyncExitStack() as stack:
+    if not options.faults:
+        return await _run(options, None, (), seconds=options.seconds, progress=progress)
+    names = tuple(f"gw-{number + 1}" for number in range(options.gateways))
+    bad = phases(options.faults, names, fault_s=options.fault_s, rest_s=options.rest_s, seed=options.seed)
+    async with space.net(names, seed=options.seed) as wire:
+        seconds = bad[-1].until_s + options.rest_s
+        return await _run(options, wire, bad, seconds=seconds, progress=progress)
+
+
+async def _run(
+    options: Options, wire: space.Net | None, bad: Sequence[Phase], *, seconds: float, progress: Progress
+) -> dict[str, Any]:
+    planned: tuple[Outage, ...] = ()
+    sites = wire.sites if wire is not None else None
+    async with planes(options, progress=progress, sites=sites) as arena, contextlib.AsyncExitStack() as stack:
         trial = Trial(options, arena)
         clients = await trial.connect(stack)
-        planned = outages(
-            arena.names,
-            seconds=options.seconds,
-            most=options.down_at_once,
-            every_s=options.every_s,
-            freezes=options.freezes,
-            seed=options.seed,
-        )
-        progress(f"{len(clients)} clients on {options.keys} keys, {len(planned)} outages")
+        if options.every_s > 0:
+            planned = outages(
+                arena.names,
+                seconds=seconds,
+                most=options.down_at_once,
+                every_s=options.every_s,
+                freezes=options.freezes,
+                seed=options.seed,
+            )
+        progress(f"{len(clients)} clients on {options.keys} keys, {len(planned)} outages, {len(bad)} faults")
         began = time.monotonic()
+        frames: dict[str, int] = {}
         async with asyncio.TaskGroup() as group:
             for client in clients:
-                group.create_task(client.work(trial.keys, began + options.seconds, pause_s=options.pause_s))
+                group.create_task(client.work(trial.keys, began + seconds, pause_s=options.pause_s))
             group.create_task(trial.faults(planned, began))
+            if wire is not None:
+                frames = await space.disturb(wire, bad, began, progress)
         result = await judge(trial, progress=progress)
     result["outages"] = dict(Counter(each.kind for each in planned))
-    return result | {"gateways": options.gateways, "clients": options.clients, "seconds": options.seconds}
+    if frames:
+        result["faults"] = {each.name: each.until_s - each.at_s for each in bad}
+        result["frames"] = frames
+    return result | {"gateways": options.gateways, "clients": options.clients, "seconds": round(seconds, 1)}
 
 
 async def judge(trial: Trial, *, progress: Progress) -> dict[str, Any]:
