@@ -29,7 +29,7 @@ from appliance.pool.api import (
     Warmed,
 )
 from appliance.pool.transfer.api import Brought, FetchAsk
-from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.api import AgreeAsk, PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
 from appliance.tasks.migration.api import (
     DrainAsk,
     DrainState,
@@ -40,6 +40,8 @@ from appliance.tasks.migration.api import (
     MoveCancelled,
 )
 from appliance.tasks.migration.moving import MOVE_S
+from appliance.tasks.watch.lines import Line
+from appliance.tasks.watch.stream import Stream
 
 R = TypeVar("R", bound=Struct)
 
@@ -131,6 +133,10 @@ class FleetClient:
     async def tasks(self, limit: int) -> TaskList:
         """The newest tasks of the fleet."""
         return await self._ask("tasks", TasksAsk(limit=limit), TaskList)
+
+    async def agree(self, task: str, *, agree: bool = True, by: str = "") -> TaskRecord:
+        """Say yes or no to the plan that is proposed for a task after a failure."""
+        return await self._ask("agree", AgreeAsk(id=task, agree=agree, by=by), TaskRecord)
 
     async def cancel(self, task: str) -> TaskRecord:
         """Stop a task."""
@@ -290,6 +296,24 @@ class FleetClient:
                     yield record
         finally:
             closer.close()
+
+    async def stream(self, task: str, *, since_s: float | None = None) -> AsyncGenerator[Line]:
+        """Yield what happens to a task, from all gateways in one order, until it has ended.
+
+        Progress, log lines of handlers and of gateways, figures, what the monitor finds and does. What is still known
+        of the past comes first; the queue is bounded, and what it drops is told in the stream.
+
+        Args:
+            task: its id.
+            since_s: leave out what was said longer ago than so many seconds; None: all that is still known.
+
+        Raises:
+            NotFoundError: there is no such task.
+        """
+        follow = Stream(self.plane, task, lambda: self.task(task)).follow(since_s=since_s)
+        async with contextlib.aclosing(follow) as lines:
+            async for line in lines:
+                yield line
 
     async def planned(self, task: str, *, timeout_s: float = 60.0) -> TaskRecord:
         """Wait until a task has a plan or has ended."""

@@ -13,6 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from appliance.console_watch import revision_lines
 from appliance.doctor import Check
 from appliance.model import (
     PLAIN_PRIORITY,
@@ -166,7 +167,7 @@ def task_table(record: TaskRecord) -> Group:
         for each in record.subtasks
         if (text := brief(each))
     ]
-    parts: list[object] = [head, table, *ways, *told]
+    parts: list[object] = [head, table, *ways, *told, *revision_lines(record)]
     if record.failure is not None:
         remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""
         parts.append(Text(f"{record.failure.message}{remedy}", style="red"))

@@ -43,7 +43,7 @@ from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
-from appliance.tasks.api import ArtifactAsk, RunAsk, TaskAsk
+from appliance.tasks.api import ArtifactAsk, RunAsk, TaskAsk, TaskLinesAsk
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
@@ -53,6 +53,7 @@ from appliance.tasks.migration.migration import Migration
 from appliance.tasks.migration.overload import Load
 from appliance.tasks.remote import Links, RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
+from appliance.tasks.watch.kept import Kept
 from appliance.vitals import Vitals
 
 log = structlog.get_logger(__name__)
@@ -80,6 +81,8 @@ class Gateway:
         self._handing_in: set[asyncio.Task[None]] = set()
         self._volumes: Volumes | None = None
         self._transfers: Transfers | None = None
+        self._kept = Kept(config.id)
+        """The last lines about tasks that this gateway has said."""
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -141,6 +144,7 @@ class Gateway:
         self.executor = Executor(self.plane, self.pool, remote, config.tasks)
         self.executor.on_change = self._changed.set
         self._leaving = Leaving(config.id, self.executor, skills=catalogue.skills, config=config.tasks.migration)
+        self.executor.telling.on_told = self._kept.hear_event
         await self.executor.start()
         await self.pool.start()
         self._stack.push_async_callback(self._stop_pool)
@@ -166,6 +170,8 @@ class Gateway:
             site=site,
         )
         self.manager.on_change = self._changed.set
+        self.manager.recovery.on_published = self._kept.hear_transition
+        rpc.register("task_lines", TaskLinesAsk, self._kept.answer)
         await self.manager.start()
         self._stack.push_async_callback(self.manager.stop)
         self.migration = Migration(
@@ -283,6 +289,7 @@ class Gateway:
         self._changed.set()
 
     def _put_log(self, line: LogLine) -> None:
+        self._kept.hear_log(line)
         self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
 
     def _on_wait(self, call: Call, note: str) -> None:
@@ -370,6 +377,7 @@ class Gateway:
             robots=self.hub.attached,
             endpoints=self.config.plane.listen,
             refused=dict(counters),
+            monitor=dict(self.manager.recovery.counts),
             started_ns=self._started_ns,
             pid=os.getpid(),
         )

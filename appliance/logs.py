@@ -4,6 +4,7 @@ Lines are JSON under systemd and readable text in a terminal. A gateway publishe
 `LogLine`, so the recorder has them and the terminal UI shows them.
 """
 
+import itertools
 import logging
 import sys
 import time
@@ -25,6 +26,7 @@ class _StandardError:
         sys.stderr.flush()
 
 
+_numbers = itertools.count(1)
 _publish: Callable[[LogLine], None] | None = None
 _PLAIN = (str, int, float, bool, type(None))
 
@@ -71,6 +73,7 @@ def _tee(logger: Any, method: str, event: MutableMapping[str, Any]) -> MutableMa
                 source=str(event.get("gateway", "")),
                 event=str(event.get("event", "")),
                 fields=fields,
+                number=next(_numbers),
             )
         )
     return event

@@ -5,17 +5,19 @@ import os
 import uuid
 from typing import Annotated
 
+import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
-from appliance.errors import NotFoundError, SwiftbotError
+from appliance.console_watch import stream_line
+from appliance.errors import NotFoundError, PayloadError, SwiftbotError
 from appliance.model import PLAIN_PRIORITY, TaskRecord, TaskRequest, TaskState
 from appliance.tasks.view import view
 
-task_app = App(name="task", help="List, show, cancel and move tasks.", group=WORK)
+task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agree to new plans.", group=WORK)
 
 
 def add_to(app: App) -> None:
@@ -140,6 +142,75 @@ def task_show(task: str, *, as_json: Json = False, where: Where = HERE) -> int:
         show(view(record), as_json=as_json, table=console.task_table(record))
 
     asyncio.run(go())
+    return 0
+
+
+@task_app.command(name="watch")
+def task_watch(
+    task: str,
+    *,
+    since: Annotated[
+        str, Parameter(help="Leave out what is older: seconds, or such as 90s, 5m, 2h, now. All that is known if not.")
+    ] = "",
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Follow a task until its end: progress, log lines, figures and findings of all gateways in one stream.
+
+    With --json a line an object. Ctrl-C leaves; the task goes on.
+    """
+    since_s = _seconds(since)
+
+    async def go() -> TaskRecord:
+        async with FleetClient(where.endpoint()) as client:
+            async for line in client.stream(task, since_s=since_s):
+                if as_json:
+                    print(msgspec.json.encode(line).decode(), flush=True)
+                else:
+                    console.out.print(stream_line(line), soft_wrap=True)
+            return await client.task(task)
+
+    try:
+        record = asyncio.run(go())
+    except KeyboardInterrupt:
+        console.err.print(f"task {task} goes on; `swiftbot task cancel {task}` stops it")
+        return 0
+    return _outcome(record)
+
+
+def _seconds(text: str) -> float | None:
+    """How far back a stream begins; None: at the beginning."""
+    if not text:
+        return None
+    if text == "now":
+        return 0.0
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    number, unit = (text[:-1], units[text[-1]]) if text[-1] in units else (text, 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds < 1e9:
+        raise PayloadError(f"--since {text[:40]!r} is no time", remedy="give seconds, or such as 90s, 5m, 2h, now")
+    return seconds
+
+
+@task_app.command(name="agree")
+def task_agree(
+    task: str,
+    *,
+    no: Annotated[bool, Parameter(negative="", help="Turn it down: the task fails with what led to it.")] = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Agree to the plan that is proposed for a task after a failure, or turn it down."""
+
+    async def go() -> TaskRecord:
+        async with FleetClient(where.endpoint()) as client:
+            return await client.agree(task, agree=not no, by=_me())
+
+    record = asyncio.run(go())
+    show(view(record), as_json=as_json, table=console.task_table(record))
     return 0
 
 

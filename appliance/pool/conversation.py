@@ -27,8 +27,12 @@ BURST = 4000.0
 """Frames that may come at once."""
 MAX_LINES = 2000
 """Log lines of one run that are passed on."""
+MAX_FIGURE = 1e12
+"""Beyond it a figure of CPU time or memory is none."""
 MAX_CALLS = 8
 """Calls of one run in progress at once: a handler's threads may each make one."""
+ALIVE_S = 2.0
+"""How often a run that waits for an answer of the appliance counts as alive: that wait has a deadline of its own."""
 _TRANSIENT = (UnreachableError, DeadlineError, RobotError, PoolError)
 
 
@@ -91,6 +95,8 @@ class Conversation:
         self._where = {"gateway": gateway, "container": container, "phase": phase}
         self._entered_ns = entered_ns
         self._started_ns = 0
+        self._used: dict[str, float] = {}
+        """CPU time and memory, as the last frame tells them."""
         self._on_event = on_event
         self._on_call = on_call
         self._refused = refused
@@ -114,7 +120,7 @@ class Conversation:
     def failed(self, code: str, message: str, *, remedy: str = "", retryable: bool = True) -> RunEvent:
         """Return the final event of a run that did not work."""
         failure = Failure(code=code, message=message, remedy=remedy, retryable=retryable)
-        return self.event(RunEventKind.FAILED, failure=failure, duration_ms=self._duration_ms())
+        return self.event(RunEventKind.FAILED, failure=failure, duration_ms=self._duration_ms(), **self._used)
 
     def _duration_ms(self) -> float | None:
         return (time.monotonic_ns() - self._started_ns) / 1e6 if self._started_ns else None
@@ -165,6 +171,8 @@ class Conversation:
                 self._progress(frame)
             case "log":
                 self._line(frame)
+            case "alive":
+                self._tell(self.event(RunEventKind.ALIVE))
             case "partial":
                 self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
@@ -173,8 +181,14 @@ class Conversation:
             case "call":
                 await self._call(frame)
             case "result":
-                result = _table(frame.get("result"))
-                return self.event(RunEventKind.SUCCEEDED, result=result, progress=1.0, duration_ms=self._duration_ms())
+                self._note_usage(frame)
+                return self.event(
+                    RunEventKind.SUCCEEDED,
+                    result=_table(frame.get("result")),
+                    progress=1.0,
+                    duration_ms=self._duration_ms(),
+                    **self._used,
+                )
             case "error":
                 return self._error(frame)
             case other:
@@ -215,7 +229,14 @@ class Conversation:
         fields = _table(frame.get("fields"))
         self._on_event(self.event(RunEventKind.LOG, note=str(frame.get("text", "")), result=fields or None))
 
+    def _note_usage(self, frame: Frame) -> None:
+        for key in ("cpu_ms", "peak_mb"):
+            value = frame.get(key)
+            if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < MAX_FIGURE:
+                self._used[key] = float(value)
+
     def _error(self, frame: Frame) -> RunEvent:
+        self._note_usage(frame)
         trace = frame.get("trace")
         for line in cast("list[object]", trace) if isinstance(trace, list) else ():
             self._line({"text": str(line)})
@@ -241,7 +262,7 @@ class Conversation:
     async def _carry_out(self, call: Call) -> None:
         reply: Frame
         try:
-            reply = {"n": call.number, "ok": await self._on_call(call)}
+            reply = {"n": call.number, "ok": await self._answer(call)}
         except SwiftbotError as error:
             reply = self._refusal(call.number, error, retryable=isinstance(error, _TRANSIENT))
         except Exception as error:
@@ -252,6 +273,16 @@ class Conversation:
         except PayloadError as error:
             self._refused["call"] += 1
             await self._reply(self._refusal(call.number, error, retryable=False))
+
+    async def _answer(self, call: Call) -> dict[str, Any]:
+        """Have a call carried out; until then the run is alive, however little it says."""
+        answering = asyncio.ensure_future(self._on_call(call))
+        try:
+            while not (await asyncio.wait({answering}, timeout=ALIVE_S))[0]:
+                self._on_event(self.event(RunEventKind.ALIVE))
+            return answering.result()
+        finally:
+            answering.cancel()
 
     @staticmethod
     def _refusal(number: int, error: SwiftbotError, *, retryable: bool) -> Frame:

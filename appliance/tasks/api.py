@@ -8,6 +8,7 @@ from msgspec import Struct
 
 from appliance.llm.settings import TierAttempt
 from appliance.model import ContainerInfo, Plan, RunEvent, TaskRecord
+from appliance.tasks.watch.lines import Line
 
 
 class TaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,6 +37,22 @@ class TaskList(Struct, frozen=True, kw_only=True):
 
     tasks: tuple[TaskRecord, ...]
     unreachable: tuple[str, ...] = ()
+
+
+class TaskLinesAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`task_lines`: the last lines that the asked gateway has said about a task."""
+
+    task: str
+    limit: int = 1000
+
+
+class TaskLines(Struct, frozen=True, kw_only=True):
+    """Lines, oldest first; `now_ns` is the gateway's clock, `dropped` how many it has forgotten or left out."""
+
+    gateway: str
+    now_ns: int
+    lines: tuple[Line, ...] = ()
+    dropped: int = 0
 
 
 class PlanAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -71,6 +71,7 @@ class Driver:
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
         self._keeper = Keeper(around.plane, record, version, on_change)
         self._keeper.on_written = self._written
+        self._keeper.on_published = around.recovery.published
         self._orders = Orders(around, self.tell)
         self._pace = Pace()
         self._hearing = Hearing(around, self._keeper, self._orders, self._pace)

@@ -41,6 +41,8 @@ class Keeper:
         """When the task was accepted, by this machine's monotonic clock."""
         self.on_written: Callable[[], None] = lambda: None
         """The record is written: what follows from it may begin."""
+        self.on_published: Callable[[Transition], None] = lambda _: None
+        """A transition that is written was published."""
 
     @property
     def elapsed_s(self) -> float:
@@ -101,6 +103,7 @@ class Keeper:
         self.on_written()
         for transition in self._pending:
             self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
+            self.on_published(transition)
         self._pending.clear()
         self._plane.session.put(self._plane.keys.task(self.record.id), encode(self.record))
         self._on_change(self.record)

@@ -243,6 +243,7 @@ class TaskManager:
             self._sweep.set()
             return await self.task(TaskAsk(id=request.id))
         self.plane.session.put(self.plane.keys.transition(record.id), encode(transition))
+        self.recovery.published(transition)
         self.plane.session.put(self.plane.keys.task(record.id), encode(record))
         log.info("task accepted", task=record.id, instruction=record.instruction)
         self._drive(record, version)

@@ -16,6 +16,7 @@ from appliance.tasks.durations import Durations
 from appliance.tasks.replan.robots import Robots
 from appliance.tasks.replan.splice import problems, splice
 from appliance.tasks.revising import ACTIVE
+from appliance.tasks.transition import Transition
 
 log = structlog.get_logger(__name__)
 
@@ -50,6 +51,8 @@ class Recovery:
         self._busy = busy
         self.counts: Counter[str] = Counter()
         """What was found and done, by kind, since start."""
+        self.on_published: Callable[[Transition], None] = lambda _: None
+        """Hears of each transition that is published here."""
 
     @property
     def manifests(self) -> Mapping[str, SkillManifest]:
@@ -63,6 +66,10 @@ class Recovery:
     def experience(self, skill: str) -> Sequence[float]:
         """How long the last runs of a skill took, seconds."""
         return self._durations.seen(skill)
+
+    def published(self, transition: Transition) -> None:
+        """Hear of a transition that was published."""
+        self.on_published(transition)
 
     def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
         """Count what was found or done, and say it in the log."""

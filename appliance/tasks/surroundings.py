@@ -15,6 +15,7 @@ from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.placement import Placement
 from appliance.tasks.replan.robots import Robots
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.transition import Transition
 
 
 class Recovering(Protocol):
@@ -31,6 +32,10 @@ class Recovering(Protocol):
 
     def experience(self, skill: str) -> Sequence[float]:
         """Return how long the last runs of a skill took, seconds."""
+        ...
+
+    def published(self, transition: Transition) -> None:
+        """Hear of a transition that was published."""
         ...
 
     def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from appliance.model import RunEvent, encode
+from appliance.model import RunEvent, RunEventKind, encode
 from appliance.plane.node import Plane
 
 MOST_RUNS = 4000
@@ -25,7 +25,8 @@ class Telling:
     def tell(self, event: RunEvent) -> None:
         """Publish an event."""
         run = (event.task, event.subtask, event.attempt)
-        number = self._numbers.get(run, 0) + 1
+        # A mere sign of life is no line of anybody's stream: it takes no number, so that none seems to be missing.
+        number = self._numbers.get(run, 0) + (event.kind is not RunEventKind.ALIVE)
         self._numbers[run] = number
         self._numbers.move_to_end(run)
         self._heard[run] = time.monotonic()

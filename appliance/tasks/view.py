@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from appliance.model import Failure, Group, SubtaskRecord, TaskRecord
+from appliance.model import Failure, Group, Proposal, Revision, SubtaskRecord, TaskRecord
 
 
 class SubtaskView(Struct, frozen=True, kw_only=True):
@@ -35,6 +35,10 @@ class SubtaskView(Struct, frozen=True, kw_only=True):
     """When its last checkpoint was kept."""
     way: str | None
     """How its container came to serve the last attempt."""
+    condition: str | None
+    """What the monitor finds of it now: `stuck`, `straggling`."""
+    cpu_ms: float | None
+    peak_mb: float | None
     result: dict[str, Any] | None
     error: Failure | None
 
@@ -61,6 +65,10 @@ class TaskView(Struct, frozen=True, kw_only=True):
     created_ns: int
     updated_ns: int
     error: Failure | None
+    revisions: tuple[Revision, ...]
+    """What was changed about its plan after failures, oldest first."""
+    proposal: Proposal | None
+    """A new plan that has not taken effect yet."""
     subtasks: tuple[SubtaskView, ...]
 
 
@@ -84,6 +92,8 @@ def view(record: TaskRecord) -> TaskView:
         created_ns=record.created_ns,
         updated_ns=record.updated_ns,
         error=record.failure,
+        revisions=record.revisions,
+        proposal=record.proposal,
         subtasks=tuple(_subtask(each) for each in record.subtasks),
     )
 
@@ -109,6 +119,9 @@ def _subtask(record: SubtaskRecord) -> SubtaskView:
         partial=record.partial,
         checkpoint_ns=record.checkpoint_ns or None,
         way=str(choice.way) if choice else None,
+        condition=record.condition or None,
+        cpu_ms=record.attempts[-1].cpu_ms if record.attempts else None,
+        peak_mb=record.attempts[-1].peak_mb if record.attempts else None,
         result=record.result,
         error=record.failure,
     )

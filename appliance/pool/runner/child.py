@@ -21,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
+from . import usage
 from .context import Context
 from .frames import FrameError, encode
 from .limits import address_space, limit_ahead, limit_run
@@ -228,6 +229,7 @@ class _Child:
     def carry_out(self, order: Frame, connection: socket.socket) -> NoReturn:
         """Run the handler, tell the outcome, end the process; SIGTERM is blocked when this begins."""
         kit, shared = self.kit, self.kit.shared
+        began_s = usage.cpu_s()
         self.link.attach(connection)
         signal.signal(signal.SIGTERM, self._asked_to_end)
         signal.signal(signal.SIGUSR1, self._asked_to_save)
@@ -250,7 +252,7 @@ class _Child:
         except OSError as error:
             frame = _error("pool", f"the run could not be set up: {explain(error)}", retryable=True)
         with contextlib.suppress(Cancelled):
-            self.link.send(frame)
+            self.link.send(frame | usage.own(began_s))
             shared[DONE] = 1
         os._exit(0)
 

@@ -117,6 +117,10 @@ class Context(Surroundings):
         """Write a line to the fleet's log."""
         self._link.send({"ev": "log", "text": str(text)[:4000], "fields": fields})
 
+    def alive(self) -> None:
+        """Give a sign of life and nothing more, now and then in a long computation; it costs next to nothing."""
+        self._link.send({"ev": "alive"})
+
     def partial(self, result: dict[str, Any]) -> None:
         """Publish what is known so far of the result; CallError when it is longer than 1 MiB of JSON."""
         self._tell("partial", "result", result, MAX_NEWS)

@@ -21,7 +21,7 @@ from pathlib import Path
 from time import monotonic
 from types import FrameType
 
-from . import child
+from . import child, usage
 from .frames import Decoder, FrameError, encode
 from .link import Frame
 from .preload import Loaded, explain, resident
@@ -278,19 +278,19 @@ class Zygote:
     def _reap(self) -> None:
         while True:
             try:
-                pid, status = os.waitpid(-1, os.WNOHANG)
+                pid, status, used = os.wait4(-1, os.WNOHANG)
             except ChildProcessError:
                 return
             if pid == 0:
                 return
             if self._run is not None and pid == self._run.pid:
                 run, self._run = self._run, None
-                self._conclude(run, status)
+                self._conclude(run, status, usage.of_reaped(used))
             elif self._ahead is not None and pid == self._ahead.pid:
                 self._ahead.forget()
                 self._ahead = None  # the next run is forked with its order
 
-    def _conclude(self, run: Run, status: int) -> None:
+    def _conclude(self, run: Run, status: int, used: Frame) -> None:
         peer = run.peer
         assert peer is not None  # noqa: S101 - a run of the moment has one
         run.kill()
@@ -299,7 +299,7 @@ class Zygote:
             return
         last = run.autopsy(status)
         if last is not None:
-            self._send(peer, last)
+            self._send(peer, last | used)
         run.close()
         with contextlib.suppress(OSError, ValueError):
             self._epoll.unregister(peer)

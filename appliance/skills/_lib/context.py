@@ -59,6 +59,10 @@ class Context(Surroundings, Protocol):
         """Write a line to the fleet's log."""
         ...
 
+    def alive(self) -> None:
+        """Give a sign of life and nothing more."""
+        ...
+
     def partial(self, result: dict[str, Any]) -> None:
         """Publish what is known so far."""
         ...

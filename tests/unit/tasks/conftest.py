@@ -407,6 +407,9 @@ class FakeRecovery:
         """Return what is known."""
         return self.known.get(skill, ())
 
+    def published(self, transition: Transition) -> None:
+        """Hear of a transition."""
+
     def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
         """Remember."""
         self.noted.append(what)
