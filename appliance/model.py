@@ -580,6 +580,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """References of the images it has and can give to others."""
     volumes: tuple[VolumeInfo, ...] = ()
     """State volumes whose newest state is there."""
+    models: tuple[str, ...] = ()
+    """Language models it plans with, in order of asking, as `tier:name`; `rules` stands for the parser."""
     robots: tuple[str, ...] = ()
     endpoints: tuple[str, ...] = ()
     refused: dict[str, int] = field(default_factory=dict[str, int])
@@ -588,6 +590,14 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What the execution monitor found and did as coordinator, by kind, since start."""
     started_ns: int = 0
     pid: int = 0
+    age_ms: int = 0
+    """How old its figures were when it was put."""
+    untold_ms: int = 0
+    """For how long its containers had changed without being told; 0: all that was put of them held."""
+    again_ms: int = 0
+    """It will be put again within so long, changed or not."""
+    asked: dict[str, float] = field(default_factory=dict[str, float])
+    """Image -> placements a second that this gateway decides, to the next power of two."""
 
 
 class Pose(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -23,15 +23,26 @@ def partners(before: Ring, now: Ring, me: str, replicas: int) -> frozenset[str]:
         me: this gateway.
         replicas: copies of a record.
     """
+    if before.points and me in before.members and not _may_gain(before, now, me, replicas):
+        return frozenset()
     found = set[str]()
     for places in _stretches(before, now, me, replicas):
         end = places[-1]
         holding = now.holders(end, replicas + 1)
         for place in places:
-            held = before.holders(place, replicas + 1) if before.points else ()
-            if me not in held[:replicas] or (holding[0] == me and held[0] != me):
+            held: tuple[str, ...] = before.holders(place, replicas + 1) if before.points else ()
+            if me not in held[:replicas] or (holding[0] == me != held[0]):
                 found.update(holding, held)
     return frozenset((found & now.members) - {me})
+
+
+def _may_gain(before: Ring, now: Ring, me: str, replicas: int) -> bool:
+    """Whether `me`, which was there, can hold more than before: only if somebody went who stood just before it."""
+    went = before.members - now.members
+    reach = replicas + len(went)
+    return any(
+        me in before.holders(point(name, number), reach) for name in went for number in range(before.virtual_nodes)
+    )
 
 
 def sharing(ring: Ring, me: str, replicas: int) -> frozenset[str]:

@@ -135,14 +135,23 @@ class Reconciler:
         settled: tuple[Ring, int] | None = None
         tries = 0
         wait_s = 0.0
+        tidy = False
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
                     await self._changed.wait()
             self._changed.clear()
             now = ring, stalls = self._membership.ring, self._pulse.stalls
+            if settled is not None and now != settled and not self._to_compare(settled, ring, stalls):
+                # Others' keys moved. What may have to be handed over waits until a burst of such news is over.
+                settled, tries, wait_s, tidy = now, 0, _AGAIN_S, True
+                await self._dht.settled(ring, stalls)
+                self._tell(self._dht.on_ring_change)
+                continue
             try:
-                heard, handed, fetched = await self._round(ring, self._to_compare(settled, ring, stalls))
+                members = [] if tidy and now == settled else self._to_compare(settled, ring, stalls)
+                tidy = False
+                heard, handed, fetched = await self._round(ring, members)
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
                 heard, handed, fetched = False, False, 0

@@ -1,14 +1,18 @@
 """The latest facts of the fleet: every gateway's status and containers, every robot. Each fact has one owner.
 
-Owners put facts when they change; whoever comes later asks each member once (`facts`). What a gateway said goes
-with it; a robot whose token goes is shown offline for a while and then forgotten.
+Owners put facts when they change (`speaker`). Whoever comes later asks: each member of a small fleet; in a large one a
+neighbour for all that it knows, and then only those it knew nothing of. A fact carries its age: since it was heard, on
+this machine's monotonic clock, and what its speaker said it was old by then; what is older than its speaker promised is
+stale, counts less in decisions, and is asked for again. What a gateway said goes with it; a robot whose token goes is
+shown offline for a while and then forgotten.
 """
 
 import asyncio
 import contextlib
 import math
+import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import structlog
 from msgspec import Struct
@@ -20,6 +24,7 @@ from appliance.plane.membership import Membership
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
+from appliance.plane.speaker import STATUS_S, Speaker
 
 log = structlog.get_logger(__name__)
 
@@ -28,22 +33,49 @@ ROBOT_KEPT_S = 300.0
 MOST_ROBOTS = 10_000
 MOST_CONTAINERS = 4096
 """Bounds on what is believed: robots in a fleet, containers of one gateway."""
+FEW = 8
+"""Members that are each asked at once; with more the newcomer asks one for all, and the others wait for it to speak."""
+LATE = 1.5
+"""A status is overdue after so many of the intervals that its speaker promised."""
 _FACTS_S = 2.0
 _FACTS_TRIES = 3
 _TICK_S = 5.0
+_GATHER_S = 0.02
+"""For so long a newcomer gathers members before it asks for their facts."""
+_SPEAK_S = 0.2
+"""For so long a newcomer is given to tell its own facts, and longer in a large fleet, at random."""
+_AT_ONCE = 8
+_PAGE_BYTES = 2**20
+_DOUBT_S = 1.0
+"""A gateway whose facts are stale is asked again at most so often."""
 
 
-class FactsAsk(Struct, frozen=True):
-    """`facts`: what do you know?"""
+class FactsAsk(Struct, frozen=True, omit_defaults=True):
+    """`facts`: what do you know? `all`: of the other gateways too, of those whose ids come after `after`."""
+
+    all: bool = False
+    after: str = ""
+
+
+class Known(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a gateway knows of another, and how old that is."""
+
+    gateway: str
+    status: GatewayStatus | None = None
+    containers: tuple[ContainerInfo, ...] = ()
+    age_ms: int = 0
 
 
 class Facts(Struct, frozen=True, omit_defaults=True):
-    """A gateway's own facts, and the robots it knows of."""
+    """A gateway's own facts, the robots it knows of, and, if asked, what it knows of other gateways."""
 
     gateway: str
     status: GatewayStatus | None = None
     containers: tuple[ContainerInfo, ...] = ()
     robots: tuple[RobotInfo, ...] = ()
+    others: tuple[Known, ...] = ()
+    more: bool = False
+    """There are further others."""
 
 
 class Registry:
@@ -56,97 +88,143 @@ class Registry:
         self.containers: dict[str, dict[str, ContainerInfo]] = {}
         self.robots: dict[str, RobotInfo] = {}
         self.on_change: list[Callable[[str], None]] = []
-        self._coalesce_s = config.coalesce_ms / 1e3
         self._session = session
         self._rpc = rpc
         self._membership = membership
         self._gateway = gateway
+        self._bounded = gateway is not None and config.view != "full"
         self._closers: list[Closer] = []
+        self._of_member: dict[str, tuple[Closer, ...]] = {}
         self._heard: dict[str, int] = {}
-        self._heard_at: dict[str, float] = {}
-        """Gateway -> when anything was last heard of it, on this machine's monotonic clock."""
+        self._as_of: dict[str, float] = {}
+        """Gateway -> when, on this clock, its status was so; what is known of its containers held then."""
+        self._container_as_of: dict[tuple[str, str], float] = {}
         self._asking: dict[str, asyncio.Task[None]] = {}
-        self._status: GatewayStatus | None = None
-        self._wanted: tuple[ContainerInfo, ...] | None = None
-        self._published: dict[str, ContainerInfo] = {}
-        self._timer: asyncio.TimerHandle | None = None
+        self._missing: set[str] = set()
+        """Members whose facts are not known and will be asked for."""
+        self._catching_up: asyncio.Task[None] | None = None
+        self._asked_by: dict[str, dict[str, float]] = {}
+        """What those gateways that decide anything say is asked for."""
+        self._doubted: dict[str, float] = {}
+        self._speaker: Speaker | None = None
         self._gone: dict[str, float] = {}
         self._sweeping: asyncio.Task[None] | None = None
         if gateway is not None:
             rpc.register("facts", FactsAsk, self._on_facts, exchange=False)
-        membership.on_joined.append(self._ask)
+            self._speaker = Speaker(
+                session, gateway, least_s=config.coalesce_ms / 1e3, most_s=config.coalesce_most_ms / 1e3,
+                listeners=lambda: len(membership.members) - 1, elsewhere=self._asked_elsewhere,
+            )  # fmt: skip
+        membership.on_joined.append(self._on_joined)
         membership.on_lost.append(self._forget)
 
     def start(self) -> None:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
         self._closers = [
-            session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
-            session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
             session.subscribe_typed(keys.robot(), RobotInfo, self._on_robot),
             session.watch_alive(keys.robot_alive(), self._on_robot_alive),
         ]
+        if not self._bounded:
+            self._closers += [
+                session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
+                session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
+            ]
         self._sweeping = asyncio.create_task(self._keep_sweeping(), name="registry")
 
     # --- our own facts ----------------------------------------------------------------------------------------
 
     def publish_status(self, status: GatewayStatus) -> None:
-        """Tell the fleet about this gateway, together with what else changes within `coalesce_ms`."""
-        self._status = status
+        """Tell the fleet about this gateway, as soon and as often as its news is worth it."""
         self.gateways[status.id] = status
-        self._soon()
+        self._as_of[status.id] = time.monotonic() - status.age_ms / 1e3
+        if self._speaker is not None:
+            self._speaker.status(status)
         self._tell("gateway")
 
     def publish_containers(self, containers: tuple[ContainerInfo, ...]) -> None:
         """Tell the fleet which containers this gateway holds: all of them; those left out are gone."""
-        self._wanted = containers
         if self._gateway is not None:
             self.containers[self._gateway] = {each.id: each for each in containers}
-        self._soon()
+        if self._speaker is not None:
+            self._speaker.containers(containers)
         self._tell("container")
 
-    def _soon(self) -> None:
-        if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(self._coalesce_s, self._publish)
+    def asked(self, image: str, *, here: bool = True) -> None:
+        """Note a decision that rests on containers of an image; `here`: made on this gateway, not for another."""
+        if self._speaker is not None:
+            self._speaker.asked(image, here=here)
 
-    def _publish(self) -> None:
-        self._timer = None
-        keys, gateway = self._session.keys, self._gateway
-        if gateway is None:
-            return
-        if self._wanted is not None:
-            wanted = {each.id: each for each in self._wanted}
-            for gone in self._published.keys() - wanted.keys():
-                self._session.delete(keys.container(gateway, gone))
-            for each in wanted.values():
-                if self._published.get(each.id) != each:
-                    self._session.put(keys.container(gateway, each.id), encode(each))
-            self._published, self._wanted = wanted, None
-        if self._status is not None:
-            self._session.put(keys.status(gateway), encode(self._status))
+    def _asked_elsewhere(self, image: str) -> float:
+        """Decisions a second that other gateways say rest on containers of an image; of any for the empty name."""
+        asked = self._asked_by.values()
+        return sum(sum(each.values()) if not image else each.get(image, 0.0) for each in asked)
 
-    async def _on_facts(self, _: FactsAsk) -> Facts:
+    async def _on_facts(self, asked: FactsAsk) -> Facts:
         gateway = self._gateway or ""
+        own = self.gateways.get(gateway)
+        others, more = self._page(asked.after) if asked.all else ((), False)
         return Facts(
             gateway=gateway,
-            status=self.gateways.get(gateway),
+            status=self._speaker.now(own) if own is not None and self._speaker is not None else own,
             containers=tuple(self.containers.get(gateway, {}).values()),
-            robots=tuple(self.robots.values()),
+            robots=() if asked.after else tuple(self.robots.values()),
+            others=others,
+            more=more,
         )
 
-    def age_s(self, gateway: str) -> float:
-        """Seconds since anything was heard of a gateway: 0 for this one, infinite for one that never told anything."""
+    def _page(self, after: str) -> tuple[tuple[Known, ...], bool]:
+        """What is known of others from an id on, as much as goes into an answer."""
+        page: list[Known] = []
+        size = 0
+        for name in sorted(each for each in self.gateways if each > after and each != self._gateway):
+            known = Known(
+                gateway=name, status=self.gateways[name], containers=tuple(self.containers.get(name, {}).values()),
+                age_ms=min(2**31, round(self.age_s(name) * 1e3)),
+            )  # fmt: skip
+            size += len(encode(known))
+            if page and size > _PAGE_BYTES:
+                return tuple(page), True
+            page.append(known)
+        return tuple(page), False
+
+    # --- how old facts are --------------------------------------------------------------------------------------
+
+    def age_s(self, gateway: str, container: str = "") -> float:
+        """How old what is known of a gateway, or of one of its containers, is at least; endless when nothing is."""
         if gateway == self._gateway:
             return 0.0
-        at = self._heard_at.get(gateway)
-        return math.inf if at is None else time.monotonic() - at
+        as_of = self._as_of.get(gateway, -math.inf)
+        if container:
+            status = self.gateways.get(gateway)
+            as_of -= status.untold_ms / 1e3 if status is not None else 0.0
+            as_of = max(as_of, self._container_as_of.get((gateway, container), -math.inf))
+        return time.monotonic() - as_of
+
+    def stale_s(self, gateway: str) -> float:
+        """For how long a gateway has been silent beyond what it promised; 0: what is known of it counts in full."""
+        status = self.gateways.get(gateway)
+        if gateway == self._gateway or status is None:
+            return 0.0
+        promised_s = status.again_ms / 1e3 if status.again_ms else STATUS_S
+        return max(0.0, self.age_s(gateway) - LATE * promised_s)
+
+    def doubt(self, gateway: str) -> None:
+        """Ask a gateway whose facts are stale for them, unless that was done a moment ago; returns at once."""
+        now = time.monotonic()
+        if gateway in self._asking or now - self._doubted.get(gateway, -math.inf) < _DOUBT_S:
+            return
+        self._doubted[gateway] = now
+        if self._is_member(gateway):
+            self._ask(gateway)
 
     # --- others' facts ----------------------------------------------------------------------------------------
 
     async def wait_for_facts(self) -> None:
         """Wait until every member that is known has told its facts, or could not within a few seconds."""
-        if self._asking:
-            await asyncio.wait(self._asking.values())
+        while self._catching_up is not None or self._asking:
+            tasks = [*self._asking.values(), *([self._catching_up] if self._catching_up is not None else [])]
+            await asyncio.wait(tasks)
 
     def _on_status(self, key: str, status: GatewayStatus | None) -> None:
         gateway = key.split("/")[-2]
@@ -156,7 +234,17 @@ class Registry:
             self._session.refuse("misplaced gw/*/status", key=key, says=status.id)
             return
         self._count(gateway)
+        self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
+
+    def _learn_status(self, gateway: str, status: GatewayStatus, *, age_s: float) -> None:
         self.gateways[gateway] = status
+        if status.asked:
+            self._asked_by[gateway] = status.asked
+        else:
+            self._asked_by.pop(gateway, None)
+        # A speaker's clock may be off, and it may lie: no fact is from the future.
+        self._as_of[gateway] = time.monotonic() - max(0.0, age_s)
+        self._missing.discard(gateway)
         self._tell("gateway")
 
     def _on_container(self, key: str, info: ContainerInfo | None) -> None:
@@ -166,6 +254,7 @@ class Registry:
         held = self.containers.setdefault(gateway, {})
         if info is None or info.state is ContainerState.DEAD:
             held.pop(container, None)
+            self._container_as_of.pop((gateway, container), None)
         elif info.id != container or info.gateway != gateway:
             self._session.refuse("misplaced gw/*/pool/*", key=key, says=f"{info.gateway}/{info.id}")
             return
@@ -174,6 +263,7 @@ class Registry:
             return
         else:
             held[container] = info
+            self._container_as_of[gateway, container] = time.monotonic()
         self._count(gateway)
         self._tell("container")
 
@@ -183,12 +273,73 @@ class Registry:
 
     def _count(self, gateway: str) -> None:
         self._heard[gateway] = self._heard.get(gateway, 0) + 1
-        self._heard_at[gateway] = time.monotonic()
 
-    def _ask(self, gateway: str) -> None:
-        """A member has come: ask for the facts it put before we listened."""
+    def _on_joined(self, gateway: str) -> None:
+        """A member has come: what it put before we listened must be asked for, of it or of one that has heard it."""
         if gateway == self._gateway:
             return
+        if self._bounded and gateway not in self._of_member:
+            keys, session = self._session.keys, self._session
+            self._of_member[gateway] = (
+                session.subscribe_typed(keys.status(gateway), GatewayStatus, self._on_status),
+                session.subscribe_typed(keys.container(gateway), ContainerInfo, self._on_container),
+            )
+        if len(self._membership.members) <= FEW:
+            self._ask(gateway)
+            return
+        self._missing.add(gateway)
+        if self._catching_up is None:
+            self._catching_up = asyncio.create_task(self._catch_up(), name="facts of the fleet")
+            self._catching_up.add_done_callback(self._caught_up)
+
+    def _caught_up(self, _: asyncio.Task[None]) -> None:
+        self._catching_up = None
+
+    async def _catch_up(self) -> None:
+        """Learn the facts of those that are missing: from one member for all, then from each that it did not know."""
+        await asyncio.sleep(_GATHER_S)
+        members = self._membership.members
+        if len(self._missing) > max(FEW, len(members) // 2):
+            await self._ask_for_all()
+        while self._missing:
+            # One that has just come tells its facts by itself; so does each to all, whom all would ask at once.
+            await asyncio.sleep(random.uniform(_SPEAK_S, _SPEAK_S + len(members) / 100))  # noqa: S311 - spreads load
+            for gateway in list(self._missing)[:_AT_ONCE]:
+                self._missing.discard(gateway)
+                if self._is_member(gateway):
+                    self._ask(gateway)
+            if self._asking:
+                await asyncio.wait(self._asking.values())
+
+    async def _ask_for_all(self) -> None:
+        others = sorted(self._membership.members - {self._gateway})
+        for neighbour in random.sample(others, min(_FACTS_TRIES, len(others))):
+            after = ""
+            try:
+                while True:
+                    ask = FactsAsk(all=True, after=after)
+                    facts = await self._rpc.call(neighbour, "facts", ask, Facts, timeout_s=_FACTS_S)
+                    self._take_robots(facts)
+                    if not after and self._is_member(neighbour):
+                        self._take(neighbour, facts)
+                    self._take_others(facts.others)
+                    if not facts.more or not facts.others or facts.others[-1].gateway <= after:
+                        return
+                    after = facts.others[-1].gateway
+            except SwiftbotError as error:
+                log.info("the facts of all could not be had", member=neighbour, reason=str(error))
+
+    def _take_others(self, others: Iterable[Known]) -> None:
+        for known in others:
+            gateway, status = known.gateway, known.status
+            if gateway == self._gateway or status is None or status.id != gateway or not self._is_member(gateway):
+                continue
+            if known.age_ms / 1e3 >= self.age_s(gateway):
+                continue  # what was heard directly is newer
+            self._take_containers(gateway, known.containers)
+            self._learn_status(gateway, status, age_s=known.age_ms / 1e3)
+
+    def _ask(self, gateway: str) -> None:
         task = asyncio.create_task(self._ask_facts(gateway), name=f"facts of {gateway}")
         self._asking[gateway] = task
         task.add_done_callback(lambda done: self._asked(gateway, done))
@@ -215,13 +366,17 @@ class Registry:
                 return
 
     def _take(self, gateway: str, facts: Facts) -> None:
-        self._heard_at[gateway] = time.monotonic()
+        self._take_containers(gateway, facts.containers)
         if facts.status is not None and facts.status.id == gateway:
-            self.gateways[gateway] = facts.status
-            self._tell("gateway")
+            # All that it holds was in the answer, told before or not.
+            status = replace(facts.status, untold_ms=0)
+            self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
+
+    def _take_containers(self, gateway: str, containers: tuple[ContainerInfo, ...]) -> None:
+        self._drop_ages(gateway)
         self.containers[gateway] = {
             each.id: each
-            for each in facts.containers[:MOST_CONTAINERS]
+            for each in containers[:MOST_CONTAINERS]
             if each.gateway == gateway and each.state is not ContainerState.DEAD
         }
         self._tell("container")
@@ -234,12 +389,20 @@ class Registry:
                     self._gone[robot.id] = time.monotonic()
                 self._tell("robot")
 
+    def _drop_ages(self, gateway: str) -> None:
+        for container in self.containers.get(gateway, {}):
+            self._container_as_of.pop((gateway, container), None)
+
     def _forget(self, gateway: str) -> None:
         """A gateway is lost: what it said goes with it, what it said of itself no longer holds."""
         if task := self._asking.pop(gateway, None):
             task.cancel()
-        self._heard.pop(gateway, None)
-        self._heard_at.pop(gateway, None)
+        for closer in self._of_member.pop(gateway, ()):
+            closer.close()
+        self._drop_ages(gateway)
+        self._missing.discard(gateway)
+        for noted in (self._heard, self._as_of, self._doubted, self._asked_by):
+            noted.pop(gateway, None)
         if self.gateways.pop(gateway, None) is not None:
             self._tell("gateway")
         if self.containers.pop(gateway, None) is not None:
@@ -296,12 +459,12 @@ class Registry:
 
     async def close(self) -> None:
         """Publish what waits, listen no more."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._publish()
-        for closer in self._closers:
+        if self._speaker is not None:
+            self._speaker.close()
+        for closer in (*self._closers, *(each for both in self._of_member.values() for each in both)):
             closer.close()
-        tasks = [each for each in (self._sweeping, *self._asking.values()) if each is not None]
+        waited = (self._sweeping, self._catching_up, *self._asking.values())
+        tasks = [each for each in waited if each is not None]
         for task in tasks:
             task.cancel()
         with contextlib.suppress(asyncio.CancelledError):

@@ -55,6 +55,9 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """How long a removal is remembered. A gateway away for longer may bring a removed record back."""
     coalesce_ms: int = 20
     """Facts changed within this time are published together: a burst of container changes is one message each."""
+    coalesce_most_ms: int = 500
+    """A fact that changes often and that nobody asks for is published this often (the paper's interval); one that is
+    asked for, the sooner. In a fleet of more than fifty all intervals grow with it."""
     queue_messages: int = 20_000
     """Bound of each queue between Zenoh and the event loop; beyond it messages are dropped and counted."""
     queue_bytes: int = 128 * 2**20
@@ -116,6 +119,7 @@ _LEAST: dict[str, float] = {
     "anti_entropy_s": 0.1,
     "tombstone_hours": 0.01,
     "coalesce_ms": 0,
+    "coalesce_most_ms": 1,
     "queue_messages": 100,
     "queue_bytes": 2**20,
     "concurrent_queries": 1,

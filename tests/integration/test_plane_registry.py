@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from appliance.errors import UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
@@ -155,7 +156,7 @@ async def test_malformed_and_oversize_facts(two: tuple[Plane, Plane]) -> None:
     size = other.config.max_payload_bytes + 1
     for key, misplaced in topics.values():
         for payload in (b"", b"{", b"\xff", b"[]", b"[" * 50_000, misplaced, b"x" * size):
-            foreign._raw.put(key, payload)
+            foreign._raw.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
     foreign.put(keys.status("stranger"), encode(GatewayStatus(id="stranger", fleet="f")))
     bad_token = foreign._raw.liveliness().declare_token(f"{keys.root}/gw/NOT A NAME/alive")
     await _until(

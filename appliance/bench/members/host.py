@@ -53,6 +53,7 @@ class Host:
         """Member that came -> member that saw it -> when."""
         self._told: dict[str, dict[str, float]] = {}
         """The same of its status."""
+        self._awaited: set[str] = set()
         self._went: dict[str, dict[str, float]] = {}
         self._publishing: list[asyncio.Task[None]] = []
         self.verbs: dict[str, Callable[[dict[str, Any]], Awaitable[Any]]] = {
@@ -65,9 +66,9 @@ class Host:
             "usage": self._usage,
         }
 
-    async def _open(self, ask: dict[str, Any]) -> dict[str, Any]:
+    async def _open(self, ask: dict[str, Any]) -> dict[str, dict[str, float]]:
         """Open these members one after the other; answers with their milestones."""
-        options, opened = self._options, {}
+        options, opened = self._options, dict[str, dict[str, float]]()
         for name in ask["names"]:
             config = PlaneConfig(
                 mode="client", connect=options.connect, lease_ms=options.lease_ms, view=options.view,
@@ -90,7 +91,7 @@ class Host:
 
         def fact(kind: str) -> None:
             if kind == "gateway":
-                for other in self._came:
+                for other in self._awaited:
                     if other in plane.registry.gateways:
                         self._told.setdefault(other, {}).setdefault(name, time.monotonic())
 
@@ -137,7 +138,7 @@ class Host:
         if key:
             found = await asyncio.gather(*(self._finds(plane, key, member) for plane in self._planes.values()))
             return {"seen": found, "told": []}
-        wanted = len(self._planes)
+        self._awaited, wanted = {member}, len(self._planes)
         while min(len(self._came.get(member, ())), len(self._told.get(member, ()))) < wanted:  # noqa: ASYNC110 - of many
             await asyncio.sleep(_LOOK_S)
         return {"seen": list(self._came[member].values()), "told": list(self._told[member].values())}
