@@ -44,7 +44,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     keep_containers: bool = True
     """On SIGTERM: leave warm containers running for the next start to adopt."""
     status_s: float = 2.0
-    """How often the gateway's status is put when nothing changes."""
+    """How often a gateway takes account of itself when nothing changes; a large fleet is told of it more rarely."""
     plane: PlaneConfig = field(default_factory=PlaneConfig)
     pool: PoolConfig = field(default_factory=PoolConfig)
     llm: LlmConfig = field(default_factory=LlmConfig)

@@ -229,7 +229,7 @@ def task_list(records: Sequence[TaskRecord]) -> Table:
 def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
     """Gateways, a line each."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
-    for name in ("gateway", "load", "memory", "containers", "runs", "tasks", "robots", "state"):
+    for name in ("gateway", "load", "memory", "containers", "runs", "tasks", "robots", "plans with", "state"):
         table.add_column(name, overflow="fold")
     for each in gateways:
         state = "draining" if each.draining else each.pool_problem or "up"
@@ -243,6 +243,7 @@ def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
             str(each.running),
             str(each.tasks),
             ", ".join(each.robots) or "–",
+            ", ".join(each.models) or "–",
             state,
         )
     return table

@@ -374,12 +374,14 @@ class Gateway:
             pool_problem=self.pool.problem or self.pool.squeeze,
             images=self._transfers.images() if self._transfers is not None else (),
             volumes=self._volumes.infos() if self._volumes is not None else (),
+            models=self.decomposer.models,
             robots=self.hub.attached,
             endpoints=self.config.plane.listen,
             refused=dict(counters),
             monitor=dict(self.manager.recovery.counts),
             started_ns=self._started_ns,
             pid=os.getpid(),
+            age_ms=round((time.monotonic() - vitals.at) * 1e3),
         )
 
     def _publish_status(self) -> None:

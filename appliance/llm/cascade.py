@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import msgspec
 import structlog
@@ -69,6 +70,12 @@ class Decomposer:
     def tiers(self) -> tuple[str, ...]:
         """The tiers there are, in order of asking."""
         return tuple(slot.planner.name.value for slot in self._slots)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The tiers with the model of each, in order of asking, for GatewayStatus."""
+        named = {"local": Path(self._config.local_model).name, "upstream": self._config.upstream_model}
+        return tuple(f"{tier}:{named[tier]}" if named.get(tier) else tier for tier in self.tiers)
 
     async def start(self) -> None:
         """Make the tiers ready; one that cannot be is named in the log and asked again with each plan."""

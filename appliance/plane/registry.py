@@ -209,6 +209,11 @@ class Registry:
         promised_s = status.again_ms / 1e3 if status.again_ms else STATUS_S
         return max(0.0, self.age_s(gateway) - LATE * promised_s)
 
+    def keeps_promise(self, gateway: str) -> bool:
+        """Whether a gateway has said when it will speak again, and is not late."""
+        status = self.gateways.get(gateway)
+        return status is not None and status.again_ms > 0 and self.stale_s(gateway) == 0
+
     def doubt(self, gateway: str) -> None:
         """Ask a gateway whose facts are stale for them, unless that was done a moment ago; returns at once."""
         now = time.monotonic()

@@ -394,6 +394,10 @@ class TaskManager:
         """Order the gateways for a subtask by the coarse score."""
         registry = self.plane.registry
         need = need_of(self.manifest(target.subtask.skill))
+        registry.asked(need.image)
+        stale_s = {name: late_s for name in self.plane.members() if (late_s := registry.stale_s(name))}
+        for name in stale_s:
+            registry.doubt(name)
         return place(
             need,
             here=self.plane.gateway,
@@ -403,6 +407,7 @@ class TaskManager:
             robot=registry.robots.get(robot) if robot else None,
             avoid=frozenset(each.gateway for each in target.attempts if each.failure),
             config=self.config,
+            stale_s=stale_s,
         )
 
     async def order(self, gateway: str, request: RunRequest) -> RunAccepted:

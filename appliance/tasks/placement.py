@@ -2,7 +2,8 @@
 
 score(gateway) = w_l · (1 − load) + w_d · proximity + w_w · warm (paper, two-level scheduling; `algorithms.md`),
 with proximity = share of the bytes of its input files and state volumes held there, or 1 where its robot's link
-is and there are none, and warm = 1 if a ready container of the image is there, 0.5 for a compatible one. A gateway
+is and there are none, and warm = 1 if a ready container of the image is there, 0.5 for a compatible one. Of a gateway
+that has been silent for longer than it promised, load and warmth count less the longer ago they were so. A gateway
 that is draining, cannot start containers and has none ready, or failed this subtask before while others remain, is
 no candidate. Ties go to the gateway that asks: it is a network hop nearer.
 """
@@ -29,6 +30,12 @@ _ANY = re.compile(r"any\d{0,2}")
 """Labels for a robot to be chosen; a robot may be called `anymal_1`."""
 
 
+STALE_HALF_S = 5.0
+"""After so long beyond its promise, half of what a gateway said of its load and containers is believed."""
+UNKNOWN_LOAD = 0.5
+"""What is expected of a gateway of which nothing is known."""
+
+
 class Placement(Struct, frozen=True, kw_only=True):
     """The gateways in order of preference, and a sentence for people on how that came about."""
 
@@ -46,6 +53,7 @@ def place(
     robot: RobotInfo | None,
     avoid: frozenset[str],
     config: TasksConfig,
+    stale_s: Mapping[str, float] | None = None,
 ) -> Placement:
     """Order the gateways a subtask could be sent to, best first.
 
@@ -58,6 +66,7 @@ def place(
         robot: the robot it commands, if any.
         avoid: gateways where an attempt at it failed; used only when nothing else is left.
         config: the weights.
+        stale_s: for how long a gateway has been silent beyond what it promised, where it has.
     """
     scored: list[tuple[float, bool, str, str]] = []
     reasons: list[str] = []
@@ -72,12 +81,12 @@ def place(
         near = holds.get(gateway, 0.0)
         if not holds and robot is not None:
             near = float(robot.gateway == gateway)
-        score = (
-            config.load_weight * (1 - min(1.0, max(0.0, status.load)))
-            + config.data_weight * near
-            + config.warm_weight * warm
-        )
-        scored.append((score, gateway == here, gateway, f"{gateway} {score:.2f}"))
+        silent_s = (stale_s or {}).get(gateway, 0.0)
+        trust = 0.5 ** (silent_s / STALE_HALF_S)
+        load = UNKNOWN_LOAD + (min(1.0, max(0.0, status.load)) - UNKNOWN_LOAD) * trust
+        score = config.load_weight * (1 - load) + config.data_weight * near + config.warm_weight * warm * trust
+        silent = f" (silent for {silent_s:.0f} s too long)" if silent_s >= 0.5 else ""
+        scored.append((score, gateway == here, gateway, f"{gateway} {score:.2f}{silent}"))
     scored.sort(key=lambda row: (row[2] in avoid, -row[0], not row[1], row[2]))
     if not scored:
         return Placement(order=(), why="; ".join(reasons) or "no gateway is present")

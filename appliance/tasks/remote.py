@@ -103,6 +103,7 @@ class RemoteContainers:
     async def find(self, need: Need) -> list[Candidate]:
         """Containers on other gateways that could serve a need, in any state, each with its round trip."""
         here = self._plane.gateway
+        self._plane.registry.asked(need.image)
         near = [each for each in self._plane.ring.successors(f"image/{need.image}", self._successors) if each != here]
         found = {(each.gateway, each.id): each for each in self._known(need)}
         asked = [] if self.ready(need) else [each for each in near if not self._is_fresh(each)]
@@ -153,7 +154,9 @@ class RemoteContainers:
     def _is_fresh(self, gateway: str) -> bool:
         if self._doubted.get(gateway, 0.0) > time.monotonic():
             return False
-        return self._plane.registry.age_s(gateway) <= FRESH_S
+        registry = self._plane.registry
+        # In a large fleet each tells its status more rarely, and says so.
+        return registry.age_s(gateway) <= FRESH_S or registry.keeps_promise(gateway)
 
     def _promised_ones(self, containers: Iterable[ContainerInfo]) -> list[ContainerInfo]:
         """As many ready containers of each gateway as runs were just sent to it; it picks them itself."""
@@ -197,6 +200,7 @@ class RemoteContainers:
 
     async def answer(self, need: Need) -> ContainerList:
         """Answer `find_containers`: the ready containers this gateway knows of."""
+        self._plane.registry.asked(need.image, here=False)
         return ContainerList(containers=tuple(each for each in self._known(need) if each.state is ContainerState.READY))
 
     # --- what selection must know beside them -------------------------------------------------------------------

@@ -1,15 +1,19 @@
 """The registry on real sessions: facts spread, reach latecomers, and go with their owner."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
 from appliance.errors import UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
+from appliance.plane import registry
 from appliance.plane.node import Plane, PlaneClient
+from appliance.plane.rpc import Rpc
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
 
@@ -172,6 +176,73 @@ async def test_malformed_and_oversize_facts(two: tuple[Plane, Plane]) -> None:
     assert other.members() == {"g0", "g1"}
     bad_token.undeclare()
     await foreign.close()
+
+
+async def test_facts_have_an_age(two: tuple[Plane, Plane], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fact's age is what its speaker said and the time since; who breaks its promise is stale, until asked again."""
+    one, other = two
+    assert one.registry.age_s("g0") == 0
+    assert one.registry.age_s("stranger") == float("inf")
+    other.registry.publish_containers((_container("g1", "a"),))
+    other.registry.publish_status(GatewayStatus(id="g1", fleet="f", age_ms=5000))
+    await _until(lambda: "g1" in one.registry.gateways and "a" in one.registry.containers.get("g1", {}))
+    assert 5 <= one.registry.age_s("g1") < 60
+    assert one.registry.age_s("g1", "a") < 5
+    assert one.registry.gateways["g1"].again_ms == 2000
+    assert one.registry.stale_s("g1") >= 2
+    assert not one.registry.keeps_promise("g1")
+    other.registry.publish_status(GatewayStatus(id="g1", fleet="f", load=0.5))
+    await _until(lambda: one.registry.stale_s("g1") == 0)
+    assert one.registry.keeps_promise("g1")
+    # Its puts are lost from now on, so that only asking helps.
+    monkeypatch.setattr(other.session, "put", lambda *_, **__: None)
+    other.registry.publish_status(GatewayStatus(id="g1", fleet="f", load=0.9))
+    await _until(lambda: one.registry.stale_s("g1") > 0)
+    one.registry.doubt("g1")
+    await _until(lambda: one.registry.gateways["g1"].load == 0.9)
+
+
+async def test_a_newcomer_asks_one_for_all(
+    tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a large fleet a newcomer has all facts from one member, with their ages; a client likewise."""
+    monkeypatch.setattr(registry, "FEW", 2)
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(5)]
+    async with contextlib.AsyncExitStack() as stack:
+        planes: list[Plane] = []
+        for number, endpoint in enumerate(endpoints[:4]):
+            config = PlaneConfig(listen=(endpoint,), connect=tuple(endpoints[:number]))
+            plane = await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=tmp_path / f"g{number}")
+            stack.push_async_callback(plane.close)
+            planes.append(plane)
+        await _until(lambda: all(len(each.members()) == 4 for each in planes))
+        for plane in planes:
+            plane.registry.publish_containers((_container(plane.gateway, f"c-{plane.gateway}"),))
+            plane.registry.publish_status(GatewayStatus(id=plane.gateway, fleet="f", age_ms=1000))
+        await _until(lambda: all(len(each.registry.gateways) == len(each.registry.containers) == 4 for each in planes))
+        asked: list[str] = []
+        call = Rpc.call
+
+        async def count(self: Rpc, gateway: str, verb: str, *rest: Any, **fields: Any) -> Any:
+            if self._gateway == "g4":
+                asked.append(verb)
+            return await call(self, gateway, verb, *rest, **fields)
+
+        monkeypatch.setattr(Rpc, "call", count)
+        config = PlaneConfig(listen=(endpoints[4],), connect=tuple(endpoints[:4]))
+        late = await Plane.open(config, fleet="f", gateway="g4", data_dir=tmp_path / "g4")
+        stack.push_async_callback(late.close)
+        await _until(lambda: len(late.registry.gateways) == 4)
+        assert asked.count("facts") <= 2
+        assert all(late.registry.age_s(f"g{number}") >= 1 for number in range(4))
+        assert {name: list(held) for name, held in late.registry.containers.items()} == {
+            f"g{number}": [f"c-g{number}"] for number in range(4)
+        }
+        late.registry.publish_status(GatewayStatus(id="g4", fleet="f"))
+        await _until(lambda: all("g4" in each.registry.gateways for each in planes))
+        client = await PlaneClient.open(_client(planes[0]), fleet="f")
+        stack.push_async_callback(client.close)
+        assert set(client.registry.gateways) == {f"g{number}" for number in range(5)}
 
 
 async def test_a_client_of_an_empty_fleet_says_so(two: tuple[Plane, Plane]) -> None:

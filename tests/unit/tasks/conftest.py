@@ -215,6 +215,20 @@ class FakeRegistry:
         """Return what the test says; by default nothing was ever heard."""
         return self.ages.get(gateway, math.inf)
 
+    def keeps_promise(self, gateway: str) -> bool:
+        """Return that nobody promised anything."""
+        return False
+
+    def stale_s(self, gateway: str) -> float:
+        """Return that nobody is late."""
+        return 0.0
+
+    def doubt(self, gateway: str) -> None:
+        """Ask nobody."""
+
+    def asked(self, image: str, *, here: bool = True) -> None:
+        """Take no notice."""
+
 
 class FakeRing:
     """One owner for all."""

@@ -55,6 +55,23 @@ def test_gateways_where_it_failed_come_last() -> None:
     assert order(gateways, warm=("gw-1",), avoid=frozenset({"gw-1"})) == ("gw-2", "gw-1")
 
 
+def test_what_was_said_long_ago_counts_less() -> None:
+    """A gateway that is silent beyond its promise loses its lead bit by bit, and the reason says so."""
+    gateways = [status("gw-1", load=0.3), status("gw-2", load=0.0)]
+    assert order(gateways, warm=("gw-2",))[0] == "gw-2"
+    assert order(gateways, warm=("gw-2",), stale_s={"gw-2": 0.2})[0] == "gw-2"
+    assert order(gateways, warm=("gw-2",), stale_s={"gw-2": 60.0})[0] == "gw-1"
+    busy = [status("gw-1", load=0.6), status("gw-2", load=1.0)]
+    assert order(busy)[0] == "gw-1"
+    assert order(busy, stale_s={"gw-2": 60.0})[0] == "gw-2"
+    found = place(
+        NEED, here="gw-1", gateways={each.id: each for each in gateways}, containers={}, holds={}, robot=None,
+        avoid=frozenset(), config=TasksConfig(), stale_s={"gw-2": 4.0},
+    )  # fmt: skip
+    assert "gw-2 0." in found.why
+    assert "(silent for 4 s too long)" in found.why
+
+
 def test_work_goes_to_its_robots_link_and_to_its_data() -> None:
     """Without input files the robot's gateway is near; with them, whoever holds them."""
     gateways = [status("gw-1"), status("gw-2"), status("gw-3")]
