@@ -30,8 +30,8 @@ def partners(before: Ring, now: Ring, me: str, replicas: int) -> frozenset[str]:
         end = places[-1]
         holding = now.holders(end, replicas + 1)
         for place in places:
-            held: tuple[str, ...] = before.holders(place, replicas + 1) if before.points else ()
-            if me not in held[:replicas] or (holding[0] == me != held[0]):
+            held = before.holders(place, replicas + 1) if before.points else ()
+            if me not in held[:replicas] or (holding[:1] == (me,) != held[:1]):
                 found.update(holding, held)
     return frozenset((found & now.members) - {me})
 
