@@ -230,9 +230,11 @@ class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
     sequence: int
     state: TaskState
     runs: tuple[LostRun, ...] = ()
-    """What differs from the version that stands: attempts it had made or finished by itself."""
+    """Its subtasks that had an attempt: which, where, and what had become of it."""
     settled: bool = False
     """Whether its runs have been ended and people told."""
+    note: str = ""
+    """What that was, in words."""
 
 
 PLAIN_PRIORITY = 5

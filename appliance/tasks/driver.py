@@ -20,6 +20,7 @@ from appliance.model import Failure, RunEventKind, SubtaskState, TaskRecord, Tas
 from appliance.tasks import machine
 from appliance.tasks.checking import Checking
 from appliance.tasks.dispatching import Dispatching
+from appliance.tasks.healing import OVERTAKEN, heal
 from appliance.tasks.hearing import Hearing
 from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import TransitionKind
@@ -152,10 +153,14 @@ class Driver:
 
     async def _resume(self) -> None:
         """Take the task over if another gateway coordinated it, ask after its runs, and plan it if need be."""
-        keeper = self._keeper
+        keeper, healing = self._keeper, heal(self.record)
         if self.record.sequence > 1 or self.record.coordinator != self._around.plane.gateway:
             keeper.apply(keeper.transition(TransitionKind.ADOPTED))
             await keeper.flush()
+        if healing is not None:
+            await healing.settle(self._around.plane, keeper)
+            for each in healing.superseded:
+                self._hearing.attempt_failed(self.record.of(each), OVERTAKEN, None)
         if self._give_up is not None and self.record.state in (TaskState.ACCEPTED, TaskState.RUNNING):
             kind = TransitionKind.CANCEL if self.record.subtasks else TransitionKind.PLAN_FAILED
             keeper.apply(keeper.transition(kind, failure=self._give_up))

@@ -9,6 +9,7 @@ from appliance.errors import NotFoundError
 from appliance.model import Failure, RunEvent, RunEventKind, SubtaskRecord, SubtaskState, TaskState
 from appliance.tasks import machine
 from appliance.tasks.bounds import tidy
+from appliance.tasks.healing import foreign
 from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders
@@ -35,7 +36,12 @@ class Hearing:
         if event.kind in (RunEventKind.LOG, RunEventKind.ALIVE):
             return False
         current = next((each for each in self._keeper.record.subtasks if each.subtask.id == event.subtask), None)
-        return current is not None and event.attempt == current.attempt and not current.state.final
+        return (
+            current is not None
+            and event.attempt == current.attempt
+            and not current.state.final
+            and not foreign(self._keeper.record, event)
+        )
 
     @property
     def next_partial_at(self) -> float | None:
@@ -64,7 +70,7 @@ class Hearing:
             target = keeper.record.of(event.subtask)
         except KeyError:
             return
-        if event.attempt != target.attempt or target.state.final:
+        if event.attempt != target.attempt or target.state.final or foreign(keeper.record, event):
             return
         event = tidy(event, max_result_bytes=self._around.config.max_result_bytes)
         common: dict[str, Any] = {

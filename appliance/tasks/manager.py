@@ -55,6 +55,8 @@ from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_
 from appliance.tasks.checkpoints import Checkpoint, read_checkpoint, remove_checkpoint
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
+from appliance.tasks.healing import heal, unheard
+from appliance.tasks.keeper import Keeper
 from appliance.tasks.listing import newest_tasks
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
@@ -69,6 +71,8 @@ SWEEP_S = 15.0
 """How often the shard is looked through when the ring stands still."""
 MAX_BREAKS = 6
 """Drivers of one task that may break before it is ended with the reason; with the pauses, half a minute."""
+AGAIN_S = (0.5, 1.5, 4.0)
+"""When the shard is looked through again after the ring has changed."""
 MAX_SUBMITTER = 120
 
 
@@ -97,6 +101,7 @@ class TaskManager:
         """How often a task's driver has broken; each time it is left alone for longer, in the end given up."""
         self._why: dict[str, Failure] = {}
         """Why the last driver of a task broke."""
+        self._healing: dict[str, asyncio.Task[None]] = {}
         self._final: dict[str, VersionVector] = {}
         """Records of the shard known to be final, which need not be decoded at every sweep."""
         self._ahead = LookAhead(plane, manifest=self.manifest, likely_place=self._likely_place, tell_here=executor.hint)
@@ -135,6 +140,7 @@ class TaskManager:
         self._closers.append(news.close)
         self.plane.on_member_lost.append(self._on_member_lost)
         self.plane.dht.on_ring_change.append(self._sweep.set)
+        self.plane.dht.on_ring_change.append(self._sweep_soon)
         self.plane.registry.on_change.append(self._on_fact)
         await self._ahead.durations.load()
         self._sweeper = asyncio.create_task(self._keep_sweeping(), name="task takeover")
@@ -154,7 +160,7 @@ class TaskManager:
         self._stopping = True
         for close in self._closers:
             close()
-        tasks = [each for each in (self._sweeper, *self._driving.values()) if each]
+        tasks = [each for each in (self._sweeper, *self._driving.values(), *self._healing.values()) if each]
         for each in tasks:
             each.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -318,9 +324,34 @@ class TaskManager:
                 continue
             if record.state.final:
                 final[stored.key] = stored.version
+                self._heal_ended(record, stored.version)
             elif record.id not in self._drivers:
                 self._drive(record, stored.version)
+            elif unheard(record, self._drivers[record.id].record):
+                # Two coordinators have met: whoever drives by the version before goes on from the merged one.
+                self._driving[record.id].cancel()
+                self._sweep_soon()
         self._final = final
+
+    def _heal_ended(self, record: TaskRecord, version: VersionVector) -> None:
+        """Tell what became of a task that had been ended on one side of a partition and went on on the other."""
+        healing = heal(record)
+        if healing is None or record.id in self._healing or self._stopping:
+            return
+        keeper = Keeper(self.plane, record, version, lambda _: None)
+        work = asyncio.create_task(healing.settle(self.plane, keeper), name=f"heal {record.id}")
+        self._healing[record.id] = work
+        work.add_done_callback(lambda done: self._healed(record.id, done))
+
+    def _healed(self, task: str, done: asyncio.Task[None]) -> None:
+        self._healing.pop(task, None)
+        if not done.cancelled() and (error := done.exception()) is not None:
+            log.info("what a partition left is settled later", task=task, reason=str(error))
+
+    def _sweep_soon(self) -> None:
+        """Look through the shard again a few times: records of the other side of a partition come bit by bit."""
+        for pause_s in AGAIN_S:
+            asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
 
     def _on_run_event(self, key: str, event: RunEvent | None) -> None:
         if event is None or (driver := self._drivers.get(event.task)) is None:

@@ -70,6 +70,8 @@ class TaskView(Struct, frozen=True, kw_only=True):
     proposal: Proposal | None
     """A new plan that has not taken effect yet."""
     subtasks: tuple[SubtaskView, ...]
+    notes: tuple[str, ...]
+    """What people should know of its course: what a partition doubled, and what was done about it."""
 
 
 def view(record: TaskRecord) -> TaskView:
@@ -95,6 +97,7 @@ def view(record: TaskRecord) -> TaskView:
         revisions=record.revisions,
         proposal=record.proposal,
         subtasks=tuple(_subtask(each) for each in record.subtasks),
+        notes=tuple(each.note for each in record.splits if each.note),
     )
 
 

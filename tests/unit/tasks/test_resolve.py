@@ -1,13 +1,16 @@
 """Concurrent versions of a task after a partition: every gateway picks the same one."""
 
-import msgspec
-from hypothesis import given
-from hypothesis import strategies as st
+import random
 
-from appliance.model import Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
+import msgspec
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from appliance.model import Attempt, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState, encode
 from appliance.plane.dht import Record
 from appliance.pool.lineage import VolumeRecord
-from appliance.tasks.resolve import resolver, stronger
+from appliance.tasks.resolve import MOST_SPLITS, merged, resolver, stronger
 
 
 def record(state: TaskState, done: int, sequence: int, coordinator: str) -> bytes:
@@ -68,3 +71,97 @@ def test_volumes_are_resolved_by_their_lineage() -> None:
         for version in ({"a": 3}, {"a": 1, "z": 1})
     )
     assert resolver("volume/v", more, fewer) == resolver("volume/v", fewer, more) == more
+
+
+def running(coordinator: str, *, progress: float = 0.0, load: float = 0.0, free: int = 0, sequence: int = 5) -> bytes:
+    """Encode a version of a task whose only subtask runs on a gateway with these figures."""
+    subtask = SubtaskRecord(
+        subtask=Subtask(id="s1", skill="count"),
+        state=SubtaskState.RUNNING,
+        gateway=coordinator,
+        progress=progress,
+        attempts=(Attempt(number=1, gateway=coordinator, load=load, free=free),),
+    )
+    return encode(
+        TaskRecord(
+            id="t", instruction="x", state=TaskState.RUNNING, subtasks=(subtask,), coordinator=coordinator,
+            sequence=sequence,
+        )
+    )  # fmt: skip
+
+
+def test_progress_then_load_then_ready_containers_then_the_lower_gateway_decide() -> None:
+    """As far as the records themselves have the figures, so that all gateways compute alike; transitions come last."""
+    far = running("gw-9", progress=0.6, load=0.9)
+    idle, busy = running("gw-9", progress=0.5, load=0.1), running("gw-1", progress=0.5, load=0.2, free=9)
+    assert merged_winner(far, idle) == far
+    assert merged_winner(idle, busy) == idle
+    many, few = running("gw-9", load=0.1, free=3), running("gw-1", load=0.1, free=2)
+    assert merged_winner(many, few) == many
+    low, high = running("gw-1"), running("gw-2", sequence=50)
+    assert merged_winner(low, high) == low
+
+
+def merged_winner(one: bytes, other: bytes) -> bytes:
+    """Which of the two stands."""
+    return stronger(one, other)
+
+
+def test_the_version_that_stands_remembers_the_one_that_lost() -> None:
+    """Whose it was, and which attempts it had made where; what a newer appliance wrote beside that is kept."""
+    fields = msgspec.json.decode(running("gw-1", progress=0.9)) | {"novelty": [1, 2]}
+    value = merged(running("gw-2"), msgspec.json.encode(fields))
+    record = msgspec.json.decode(value, type=TaskRecord)
+    (split,) = record.splits
+    assert (split.coordinator, split.settled) == ("gw-2", False)
+    assert [(each.subtask, each.attempt, each.gateway) for each in split.runs] == [("s1", 1, "gw-2")]
+    assert msgspec.json.decode(value)["novelty"] == [1, 2]
+    one, other = (
+        Record(key="task/t", value=each, version={"a": 1}, write="w")
+        for each in (running("gw-1", progress=0.9), running("gw-2"))
+    )
+    assert resolver("task/t", one, other).write == "", "its writer would take it for its own"
+
+
+def test_what_was_settled_stays_settled() -> None:
+    """A copy that knows a lost version as unsettled does not bring it back."""
+    first = msgspec.json.decode(merged(running("gw-1", progress=0.9), running("gw-2")), type=TaskRecord)
+    settled = replace(first, splits=tuple(replace(each, settled=True) for each in first.splits))
+    met = msgspec.json.decode(merged(encode(settled), encode(first)), type=TaskRecord)
+    assert met.splits == settled.splits
+
+
+PARTS = st.one_of(
+    st.builds(
+        running,
+        st.sampled_from(["gw-1", "gw-2", "gw-3", "gw-4"]),
+        progress=st.sampled_from([0.0, 0.5]),
+        load=st.sampled_from([0.0, 0.5]),
+        free=st.integers(0, 2),
+        sequence=st.integers(1, 12),
+    ),
+    VERSIONS,
+)
+
+
+@settings(deadline=None)
+@given(st.lists(PARTS, min_size=3, max_size=12), st.randoms(use_true_random=False))
+def test_parts_that_meet_in_any_order_come_to_the_same_record(parts: list[bytes], rng: random.Random) -> None:
+    """Commutative and associative, and bounded, however often copies meet again."""
+    one, two, three = parts[:3]
+    assert merged(one, two) == merged(two, one)
+    assert merged(merged(one, two), three) == merged(one, merged(two, three))
+    ends = set()
+    for _ in range(3):
+        rng.shuffle(parts)
+        copies = [*parts, *parts[:2]]
+        while len(copies) > 1:
+            rng.shuffle(copies)
+            copies.append(merged(copies.pop(), copies.pop()))
+        ends.add(copies[0])
+    assert len(ends) == 1
+    try:
+        record = msgspec.json.decode(ends.pop(), type=TaskRecord)
+    except msgspec.DecodeError:
+        return
+    assert len(record.splits) <= MOST_SPLITS

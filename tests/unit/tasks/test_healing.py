@@ -1,0 +1,128 @@
+"""After a partition: doubled runs are ended, attempts fenced off, people told; once, and one's own go on."""
+
+import asyncio
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from appliance.model import (
+    Attempt,
+    LostRun,
+    Notice,
+    RunEvent,
+    RunEventKind,
+    Split,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+    encode,
+)
+from appliance.plane.dht import Record
+from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.healing import foreign, heal
+from appliance.tasks.keeper import Keeper
+from appliance.tasks.machine import apply
+from appliance.tasks.surroundings import RunNews, task_key
+from appliance.tasks.transition import Transition, TransitionKind
+
+pytestmark = pytest.mark.anyio
+
+
+def split(*runs: LostRun, coordinator: str = "gw-3", state: TaskState = TaskState.RUNNING) -> Split:
+    """A version that lost."""
+    return Split(coordinator=coordinator, sequence=9, state=state, runs=runs)
+
+
+def lost(attempt: int, gateway: str, state: SubtaskState = SubtaskState.RUNNING) -> LostRun:
+    """What it had of s1."""
+    return LostRun(subtask="s1", attempt=attempt, gateway=gateway, state=state)
+
+
+def record_of(plane: Any, *splits: Split, robot: str | None = None, attempt: int = 1) -> TaskRecord:
+    """A record whose s1 runs on gw-1, with versions that lost."""
+    record = apply(plane.accepted(), _step(2, TransitionKind.PLANNED, plan=plane.plan_of()))
+    record = apply(record, _step(3, TransitionKind.DISPATCHED, subtask="s1", attempt=1, gateway="gw-1", robot=robot))
+    target = record.subtasks[0]
+    attempts = (*target.attempts, *(Attempt(number=number, gateway="gw-1") for number in range(2, attempt + 1)))
+    return replace(record, subtasks=(replace(target, attempts=attempts),), splits=splits)
+
+
+def _step(sequence: int, kind: TransitionKind, **fields: Any) -> Transition:
+    return Transition(task="t-1", sequence=sequence, kind=kind, at_ns=1, coordinator="gw-1", **fields)
+
+
+def test_doubled_runs_are_ended_and_later_attempts_fenced_off(plane: Any) -> None:
+    """Those of the other side that are under way; not one's own, nor what has ended; the fence is the highest."""
+    record = record_of(plane, split(lost(1, "gw-1"), lost(4, "gw-3"), lost(3, "gw-2", SubtaskState.SUCCEEDED)))
+    healing = heal(record)
+    assert healing is not None
+    assert [(each.attempt, each.gateway) for each in healing.ends] == [(4, "gw-3")]
+    assert healing.fences == {"s1": 4}
+    assert healing.superseded == ()
+    (note,) = healing.notes
+    assert "s1 (attempt 4 on gw-3: ended now)" in note
+    assert "attempt 3 on gw-2: it had succeeded" in note
+    after = apply(record, _step(4, TransitionKind.HEALED, splits=healing.splits, fences=healing.fences))
+    assert heal(after) is None
+    assert after.subtasks[0].next_attempt == 5
+
+
+def test_nothing_doubled_is_nothing_to_tell(plane: Any) -> None:
+    """Two views of one course, as when a coordinator was taken over: settled without a word."""
+    healing = heal(record_of(plane, split(lost(1, "gw-1"))))
+    assert healing is not None
+    assert (healing.ends, healing.notes) == ((), ())
+
+
+def test_a_run_whose_robot_has_heard_a_later_attempt_is_repeated(plane: Any) -> None:
+    """The robot would refuse it from now on; one without a robot goes on."""
+    for robot, expected in (("r1", ("s1",)), (None, ())):
+        healing = heal(record_of(plane, split(lost(2, "gw-3")), robot=robot))
+        assert healing is not None
+        assert healing.superseded == expected
+
+
+def test_news_of_a_run_that_lost_are_refused_even_under_the_same_number(plane: Any) -> None:
+    """Two gateways may run attempt 2 of one subtask: the record's own counts, the other's result does not."""
+    record = record_of(plane, split(lost(1, "gw-3")))
+    event = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.SUCCEEDED, gateway="gw-3")
+    assert foreign(record, event)
+    assert not foreign(record, replace(event, gateway="gw-1"))
+    assert not foreign(replace(record, splits=()), event)
+
+
+async def test_a_driver_settles_what_was_lost_before_it_goes_on(bench: Any) -> None:
+    """The run of the other side is ended there, its result is refused, people are told, the task ends by its own."""
+    record = record_of(bench.plane, split(lost(1, "gw-3")))
+
+    async def running(gateway: str, ask: RunAsk) -> RunStatus:
+        return RunStatus(running=True)
+
+    bench.plane.rpc.on = {"run_status": running, "run_cancel": running}
+    await bench.start(record)
+    await bench.until(lambda found: bool(found.splits) and found.splits[0].settled)
+    async with asyncio.timeout(5):
+        while not bench.plane.session.sent(bench.plane.keys.notice(), Notice):
+            await asyncio.sleep(0.005)
+    ended = [(gateway, ask.attempt) for gateway, verb, ask in bench.plane.rpc.calls if verb == "run_cancel"]
+    assert ended == [("gw-3", 1)]
+    for gateway in ("gw-3", "gw-1"):
+        event = RunEvent(
+            task="t-1", subtask="s1", attempt=1, kind=RunEventKind.SUCCEEDED, gateway=gateway, result={"of": gateway}
+        )
+        bench.driver.tell(RunNews(event))
+    last = await bench.end()
+    assert last.subtasks[0].result == {"of": "gw-1"}
+    assert "partition" in bench.stored().splits[0].note
+
+
+async def test_an_ended_task_tells_what_went_on_elsewhere(plane: Any) -> None:
+    """The version that stands has ended: the other side's run is ended all the same, and the record has the note."""
+    record = replace(record_of(plane, split(lost(2, "gw-3"))), state=TaskState.SUCCEEDED)
+    plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(record), version={"gw-1": 7})
+    healing = heal(record)
+    assert healing is not None
+    await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
+    assert [(gateway, verb) for gateway, verb, _ in plane.rpc.calls] == [("gw-3", "run_cancel")]
+    assert plane.session.sent(plane.keys.task(), TaskRecord)[-1].splits[0].settled
