@@ -74,7 +74,7 @@ def write(answer: Answer, words: Words, catalogue: Catalogue) -> list[str]:
             symbols.append("|")
         manifest = catalogue.skills[subtask.skill]
         symbols.append(subtask.skill)
-        if subtask.robot is not None and _has_robot(subtask.skill, manifest):
+        if subtask.robot is not None and has_robot(subtask.skill, manifest):
             symbols += writer.robot(subtask.robot)
         for name, value in subtask.params.items():
             symbols += [f"{name}:", *writer.value(name, value)]
@@ -83,7 +83,8 @@ def write(answer: Answer, words: Words, catalogue: Catalogue) -> list[str]:
     return symbols
 
 
-def _has_robot(skill: str, manifest: SkillManifest) -> bool:
+def has_robot(skill: str, manifest: SkillManifest) -> bool:
+    """Whether a subtask of this skill says its robot: not where the skill settles it."""
     return manifest.runs != "compute" and skill not in JOINT
 
 
@@ -97,8 +98,10 @@ class _Writer:
     def robot(self, robot: str) -> list[str]:
         if ANY.fullmatch(robot):
             return [robot]
-        found = self._whole(robot, values.robot) or self._pieces(robot.replace("_", " "))
-        return found or [json.dumps(robot)]
+        found = self._whole(robot, values.robot)
+        if not found and values.robot(robot.replace("_", " ")) == robot:
+            found = self._pieces(robot.replace("_", " "))
+        return found or [json.dumps(robot, ensure_ascii=False)]
 
     def value(self, name: str, value: Any) -> list[str]:
         if isinstance(value, list):
@@ -117,8 +120,8 @@ class _Writer:
             return self._whole(value, values.free) or [json.dumps(value, ensure_ascii=False)]
         found = self._whole(value, values.name)
         if not found and "_" in value:
-            robot = self._whole(value, values.robot) or self._pieces(value.replace("_", " "))
-            found = ["@", *robot] if robot else []
+            robot = self.robot(value)
+            found = ["@", *robot] if robot[0].startswith("w") else []
         found = found or self._pieces(value)
         return found or [json.dumps(value, ensure_ascii=False)]
 
@@ -216,7 +219,7 @@ class _Reader:
         manifest = self._catalogue.skills.get(skill)
         if manifest is None:
             self._fail(f"there is no skill {skill!r}")
-        robot = self._robot() if _has_robot(skill, manifest) else None
+        robot = self._robot() if has_robot(skill, manifest) else None
         params: dict[str, Any] = {}
         while self._peek().endswith(":") and not self._peek().startswith('"'):
             name = self._take()[:-1]
@@ -297,7 +300,7 @@ class _Reader:
         text = self._words.run(first, last)
         if name in values.FREE:
             return values.free(text)
-        if kind is not None and _is_number(kind):
+        if kind is not None and is_number(kind):
             meant = values.quantity(text, values.unit_of(kind))
             if meant is None:
                 self._fail(f"{text!r} is no {kind}")
@@ -330,5 +333,6 @@ class _Reader:
 _NUMERIC = frozenset({"laps", "count", "epochs", "fps"})
 
 
-def _is_number(parameter: str) -> bool:
+def is_number(parameter: str) -> bool:
+    """Whether a parameter takes a number."""
     return parameter in _NUMERIC or bool(values.unit_of(parameter))

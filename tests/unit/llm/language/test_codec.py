@@ -1,9 +1,10 @@
 """The plan language: it says every plan, and only plans."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.errors import PlanError
@@ -55,7 +56,7 @@ def plans(draw: st.DrawFn) -> Answer:
     for number in range(1, draw(st.integers(1, 5)) + 1):
         skill = draw(st.sampled_from(sorted(CATALOGUE.skills)))
         manifest = CATALOGUE.skills[skill]
-        params: dict[str, object] = {}
+        params: dict[str, Any] = {}
         for name, param in manifest.params.items():
             if param.type == "array":
                 params[name] = draw(st.lists(TEXTS.filter(lambda each: each != "operator"), min_size=1, max_size=3))
@@ -65,7 +66,7 @@ def plans(draw: st.DrawFn) -> Answer:
                 params[name] = draw(st.integers(1, 10**6) | st.floats(0.001, 1e6))
         robot = None if manifest.runs == "compute" else draw(TEXTS)
         if "robots" in params and manifest.runs != "compute":
-            robot = params["robots"][0]  # type: ignore[index]
+            robot = params["robots"][0]
         after = draw(st.sets(st.integers(1, number - 1), max_size=3)) if number > 1 else set[int]()
         subtasks.append(
             Subtask(
@@ -79,6 +80,7 @@ def plans(draw: st.DrawFn) -> Answer:
     return Answer(domain="navigation", subtasks=tuple(subtasks))
 
 
+@settings(deadline=None)
 @given(plans(), st.text(max_size=80))
 def test_every_plan_comes_back(answer: Answer, instruction: str) -> None:
     """Also a plan that has nothing to do with the instruction is said, by literals, and read as the same."""
@@ -113,6 +115,7 @@ SYMBOLS = st.sampled_from(
 )
 
 
+@settings(deadline=None)
 @given(st.lists(SYMBOLS, max_size=20))
 def test_anything_else_is_refused(symbols: list[str]) -> None:
     """Symbols that are no answer raise PlanError and nothing else."""

@@ -1,7 +1,7 @@
 """What words mean as names, robots and quantities."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.llm.language import values
@@ -85,6 +85,7 @@ def test_units_stand_in_the_name() -> None:
     ]
 
 
+@settings(deadline=None)
 @given(st.text(max_size=60), st.sampled_from(["s", "ms", "m", "mps", ""]))
 def test_no_text_breaks_them(text: str, unit: str) -> None:
     """Whatever is said is a name, a text and a robot, and a quantity or none."""

@@ -1,0 +1,104 @@
+# pyright: basic, reportMissingImports=false
+# PyTorch is of the extra `train`, which neither gateways nor the development environment have.
+"""How well a model answers examples, counted by the shared scorer.
+
+It answers greedily and held by nothing: what the guide adds (`language.guide`) is seen by the benchmark of plans.
+"""
+
+import importlib.util
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from appliance.errors import NotFoundError, PlanError
+from appliance.llm.language.codec import Answer, read
+from appliance.llm.language.words import Words, words_of
+from appliance.llm.train.examples import Example
+from appliance.llm.train.tokens import END, PAD, Tokens
+from appliance.skills.catalogue import Catalogue
+
+FIGURES = ("decomposition", "parallel_recall", "subtask_f1", "param_f1", "exact", "domain", "valid")
+MAX_ANSWER = 320
+
+
+def answers(model: Any, tokens: Tokens, prompts: Sequence[list[int]], *, batch: int = 64) -> list[list[int]]:
+    """Return the tokens a model answers to prompts, the likeliest each time."""
+    order = sorted(range(len(prompts)), key=lambda number: len(prompts[number]))
+    found: list[list[int]] = [[] for _ in prompts]
+    pad, device = tokens.of(PAD), next(model.parameters()).device
+    for begin in range(0, len(order), batch):
+        chosen = order[begin : begin + batch]
+        longest = max(len(prompts[number]) for number in chosen)
+        inputs = torch.full((len(chosen), longest), pad)
+        mask = torch.zeros((len(chosen), longest), dtype=torch.long)
+        for row, number in enumerate(chosen):
+            inputs[row, longest - len(prompts[number]) :] = torch.tensor(prompts[number])
+            mask[row, longest - len(prompts[number]) :] = 1
+        with torch.inference_mode(), torch.autocast(device.type, dtype=torch.bfloat16):
+            out = model.generate(
+                input_ids=inputs.to(device),
+                attention_mask=mask.to(device),
+                max_new_tokens=MAX_ANSWER,
+                do_sample=False,
+                eos_token_id=tokens.of(END),
+                pad_token_id=pad,
+            )
+        for row, number in enumerate(chosen):
+            found[number] = out[row, longest:].tolist()
+    return found
+
+
+def judge(model: Any, tokens: Tokens, examples: Sequence[Example], catalogue: Catalogue) -> dict[str, Any]:
+    """Return percent by figure over examples, refusals counted apart (`refused`: answered alike)."""
+    score = scorer()
+    rows: list[dict[str, Any]] = []
+    refused: list[bool] = []
+    said = answers(model, tokens, [tokens.prompt(each.words, each.own) for each in examples])
+    for example, answer in zip(examples, said, strict=True):
+        words = words_of(" ".join(example.words[: example.own]), example.words[example.own :])
+        symbols = tokens.symbols(answer)
+        if example.symbols[0] == "none":
+            refused.append(symbols[:1] == ["none"])
+            continue
+        gold = read(example.symbols, words, catalogue)
+        rows.append(score.score_case({"id": "", "gold": _plain(gold)}, _prediction(symbols, words, catalogue)))
+    figures: dict[str, Any] = {"cases": len(rows)}
+    for name in FIGURES:
+        values = [float(row[name]) for row in rows if row[name] is not None]
+        figures[name] = round(100 * sum(values) / len(values), 1) if values else None
+    figures["refused"] = round(100 * sum(refused) / len(refused), 1) if refused else None
+    return figures
+
+
+def _prediction(symbols: Sequence[str], words: Words, catalogue: Catalogue) -> dict[str, Any]:
+    try:
+        return _plain(read(symbols, words, catalogue))
+    except PlanError:
+        return {}
+
+
+def _plain(answer: Answer) -> dict[str, Any]:
+    subtasks = [
+        {"id": each.id, "skill": each.skill, "robot": each.robot, "params": each.params, "after": list(each.after)}
+        for each in answer.subtasks
+    ]
+    return {"domain": answer.domain, "subtasks": subtasks}
+
+
+def scorer() -> ModuleType:
+    """Return the shared scorer, `decomposition/score.py` of `$SWIFTBOT_SHARED` or of ../shared."""
+    named = os.environ.get("SWIFTBOT_SHARED", "")
+    folder = Path(named) if named else Path(__file__).resolve().parents[4] / "shared"
+    path = folder / "decomposition" / "score.py"
+    spec = importlib.util.spec_from_file_location("decomposition_score", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise NotFoundError(
+            f"no scorer at {path}", remedy="set SWIFTBOT_SHARED to the folder with decomposition/score.py"
+        )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

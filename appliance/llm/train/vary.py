@@ -1,0 +1,345 @@
+"""Makes an example another one whose plan is exact as well.
+
+Each variation changes words only where the plan's meaning does not depend on them, or changes words and plan alike:
+other names, two instructions as one, other marks and fillers, misspelt words that name nothing, figures as words,
+another roster. What cannot be varied safely (a group's "both drones", say) is left as it is.
+"""
+
+import random
+import re
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from appliance.llm.language import values
+from appliance.llm.language.codec import ANY
+from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
+from appliance.llm.train.lexicon import Lexicon
+
+MAX_WORDS = 160
+MAX_SUBTASKS = 14
+_NUMERIC = frozenset({"laps", "count", "epochs", "fps"})
+_MARK = re.compile(r"[^\w\s]+")
+_NUMBER_WORDS = (
+    *("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"),
+    *("thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen", "nineteen", "twenty"),
+)
+_OF_NUMBERS = frozenset(
+    {
+        *_NUMBER_WORDS,
+        "twenty",
+        "thirty",
+        "forty",
+        "fifty",
+        "sixty",
+        "seventy",
+        "eighty",
+        "ninety",
+        "hundred",
+        "thousand",
+    }
+    | {"and", "-", "half", "quarter", "quarters", "oh", "niner", "dozen", "point"}
+)
+_PHRASES: dict[str, list[str]] = tomllib.loads(Path(__file__).with_name("phrases.toml").read_text(encoding="utf-8"))
+_LEADS = frozenset(
+    {"then", "after", "afterwards", "next", "finally", "and", "once", "when", "meanwhile"}
+    | {"while", "or", "but", "also", "later", "before", "first", "if"}
+)
+
+
+def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: random.Random) -> Example:
+    """Return a variation of an example.
+
+    Args:
+        example: the example.
+        others: examples that may be joined to it.
+        lexicon: nouns for other names.
+        rng: of everything that is random.
+    """
+    made = example
+    if others and rng.random() < 0.3:
+        made = joined(made, rng.choice(others), rng) or made
+    if rng.random() < 0.8:
+        made = renamed(made, lexicon, rng)
+    for chance, change in _CHANGES:
+        if rng.random() < chance:
+            made = change(made, rng)
+    return made if len(made.words) <= MAX_WORDS else example
+
+
+# --- names ---------------------------------------------------------------------------------------------------------
+
+
+def renamed(example: Example, lexicon: Lexicon, rng: random.Random, *, share: float = 0.7) -> Example:
+    """Return an example with other names for what it names, each the same wherever it is said."""
+    found = list(spans(example))
+    if any(span.first >= example.own for span in found):
+        return example  # a group was resolved by the roster: the names' kinds matter
+    runs: dict[tuple[str, ...], Span] = {}
+    for span in found:
+        numeric = span.role in _NUMERIC or values.unit_of(span.role)
+        if span.alone and not numeric and span.role not in values.FREE:
+            runs.setdefault(example.words[span.first : span.last + 1], span)
+    swaps: list[tuple[int, int, Sequence[str]]] = []
+    taken: set[int] = set()
+    roster = {word: word for word in example.words[example.own :]}
+    # The longest first: "red box" before "box".
+    for words, span in sorted(runs.items(), key=lambda each: -len(each[0])):
+        if rng.random() > share:
+            continue
+        places = [at for at in range(example.own - len(words) + 1) if example.words[at : at + len(words)] == words]
+        places = [at for at in places if not taken & set(range(at, at + len(words)))]
+        if not all(_movable(found, at, at + len(words) - 1) for at in places):
+            continue
+        other = lexicon.noun(span.role, rng)
+        name = values.robot(" ".join(words))
+        if span.role == ROBOT and name in roster:
+            roster[name] = values.robot(" ".join(other))
+        elif name in roster:
+            continue
+        for at in places:
+            swaps.append((at, at + len(words) - 1, other))
+            taken.update(range(at, at + len(words)))
+    for number in range(example.own, len(example.words)):
+        word = example.words[number]
+        if roster[word] != word:
+            swaps.append((number, number, (roster[word],)))
+    return substitute(example, sorted(swaps, key=lambda each: each[0])) if swaps else example
+
+
+def _movable(found: Sequence[Span], first: int, last: int) -> bool:
+    """Whether every pointer keeps clear of a run, is the run, or covers it."""
+    return all(
+        span.last < first
+        or span.first > last
+        or (
+            span.first <= first
+            and span.last >= last
+            and span.role not in values.FREE
+            and (span.first, span.last) == (first, last)
+        )
+        or (span.first <= first and span.last >= last and span.role in values.FREE)
+        for span in found
+    )
+
+
+# --- two as one ----------------------------------------------------------------------------------------------------
+
+
+def joined(one: Example, two: Example, rng: random.Random) -> Example | None:
+    """Return two instructions as one, in order or side by side; None where that would not be clear."""
+    if "none" in (one.symbols[0], two.symbols[0]) or len(one.words) > one.own or len(two.words) > two.own:
+        return None
+    if two.words[0] in _LEADS or len(one.words) + len(two.words) > MAX_WORDS:
+        return None
+    firsts, seconds = _robots(one), _robots(two)
+    if "all" in firsts | seconds or _count(one) + _count(two) > MAX_SUBTASKS:
+        return None
+    anys = {each for each in firsts | seconds if ANY.fullmatch(each)}
+    named = not anys
+    in_order = True
+    second = list(two.symbols)
+    if named and not firsts & seconds and firsts and seconds:
+        roll = rng.random()
+        in_order = roll < 0.4
+        link = rng.choice(_PHRASES["then"] if in_order else _PHRASES["meanwhile"] if roll < 0.7 else _PHRASES["beside"])
+    elif anys == {"any"} and firsts in ({"any"}, set()) and seconds in ({"any"}, set()):
+        link = rng.choice(_PHRASES["then"])
+    elif len(firsts) == 1 and not anys & firsts and seconds == {"any"} and "robots:" not in one.symbols:
+        # A robot named once: what follows without a name is its own.
+        robot = next(span for span in spans(one) if span.role == ROBOT)
+        if not robot.alone:
+            return None
+        link = rng.choice(_PHRASES["then"])
+        second = _with_robot(second, (f"w{robot.first}", f"w{robot.last}"))
+    else:
+        return None
+    return _linked(one, two, second, link, in_order=in_order)
+
+
+def _linked(one: Example, two: Example, second: Sequence[str], link: str, *, in_order: bool) -> Example:
+    first_words = list(one.words)
+    while first_words and _MARK.fullmatch(first_words[-1]) and len(first_words) - 1 not in pointed(one):
+        first_words.pop()
+    words = (*first_words, *link.split(), *two.words)
+    shift, count = len(words) - len(two.words), _count(one)
+    lasts = [str(each) for each in _lasts(one.symbols)]
+    symbols = list(one.symbols)
+    for part in _subtasks(second[1:]):
+        body, after = (part[: part.index("<")], part[part.index("<") + 1 :]) if "<" in part else (part, [])
+        before = [str(int(each) + count) for each in after] or (lasts if in_order else [])
+        symbols += ["|", *(_shifted(each, shift) for each in body), *(["<", *before] if before else [])]
+    longer = _count(two) >= count
+    return Example(words, len(words), (second[0] if longer else symbols[0], *symbols[1:]))
+
+
+def _shifted(symbol: str, by: int) -> str:
+    if symbol.startswith("="):
+        return symbol[1:]
+    return f"w{int(symbol[1:]) + by}" if re.fullmatch(r"w\d+", symbol) else symbol
+
+
+def _with_robot(symbols: Sequence[str], pointer: Sequence[str]) -> list[str]:
+    """Return symbols with `any` replaced by a pointer that is not to be moved (marked with =)."""
+    made: list[str] = []
+    for each in symbols:
+        made += [f"={word}" for word in pointer] if each == "any" else [each]
+    return made
+
+
+def _subtasks(symbols: Sequence[str]) -> list[list[str]]:
+    parts: list[list[str]] = [[]]
+    for each in symbols:
+        if each == "|":
+            parts.append([])
+        else:
+            parts[-1].append(each)
+    return parts
+
+
+def _count(example: Example) -> int:
+    return 1 + example.symbols.count("|")
+
+
+def _lasts(symbols: Sequence[str]) -> list[int]:
+    """Return the numbers of the subtasks after which none comes."""
+    parts = _subtasks(symbols[1:])
+    before = {int(each) for part in parts if "<" in part for each in part[part.index("<") + 1 :]}
+    return [number for number in range(1, len(parts) + 1) if number not in before]
+
+
+def _robots(example: Example) -> set[str]:
+    """Return the robots of a plan, as ids; `any`, `all` and the like as they are."""
+    found = {each for each in example.symbols if ANY.fullmatch(each)}
+    for span in spans(example):
+        if span.role == ROBOT:
+            found.add(values.robot(" ".join(example.words[span.first : span.last + 1])) + ("" if span.alone else "+"))
+    return found
+
+
+# --- marks, fillers, slips -----------------------------------------------------------------------------------------
+
+
+def unmarked(example: Example, rng: random.Random) -> Example:
+    """Return an example without marks between words, as a transcript has none; or without some of them."""
+    kept = pointed(example)
+    share = 1.0 if rng.random() < 0.5 else 0.5
+    runs: list[tuple[int, int, Sequence[str]]] = [
+        (number, number, ())
+        for number, word in enumerate(example.words[: example.own])
+        if number not in kept and _MARK.fullmatch(word) and rng.random() < share
+    ]
+    return substitute(example, runs) if len(runs) < example.own else example
+
+
+def talkative(example: Example, rng: random.Random) -> Example:
+    """Return an example with a word or two that say nothing, before, after or within."""
+    if example.symbols[0] == "none":
+        return example
+    words = example.words
+    made = example
+    roll = rng.random()
+    if roll < 0.45:
+        opening = rng.choice(_PHRASES["openings"]).split()
+        comma = [","] if rng.random() < 0.4 and opening[-1] not in ("to", "you") else []
+        made = _inserted(made, 0, [*opening, *comma])
+    if roll > 0.35 and roll < 0.75:
+        comma = [","] if rng.random() < 0.3 else []
+        made = _inserted(made, made.own, [*comma, *rng.choice(_PHRASES["endings"]).split()])
+    if roll > 0.7:
+        inside = {number for span in spans(made) for number in range(span.first + 1, span.last + 1)}
+        free = [number for number in range(1, made.own) if number not in inside]
+        if free and len(words) > 3:
+            made = _inserted(made, rng.choice(free), rng.choice(_PHRASES["between"]).split())
+    return made
+
+
+def _inserted(example: Example, at: int, words: Sequence[str]) -> Example:
+    symbols = tuple(
+        f"w{int(each[1:]) + (len(words) if int(each[1:]) >= at else 0)}" if re.fullmatch(r"w\d+", each) else each
+        for each in example.symbols
+    )
+    return Example((*example.words[:at], *words, *example.words[at:]), example.own + len(words), symbols)
+
+
+def misspelt(example: Example, rng: random.Random) -> Example:
+    """Return an example with slips in words that name nothing."""
+    kept = pointed(example)
+    runs: list[tuple[int, int, Sequence[str]]] = []
+    for number, word in enumerate(example.words[: example.own]):
+        if number in kept or len(word) < 4 or not word.isalpha() or rng.random() > 0.12:
+            continue
+        at = rng.randrange(1, len(word) - 1)
+        slips = (
+            word[:at] + word[at + 1] + word[at] + word[at + 2 :],
+            word[:at] + word[at + 1 :],
+            word[:at] + word[at] + word[at:],
+            word[:at] + rng.choice("abcdefghijklmnopqrstuvwxyz") + word[at + 1 :],
+        )
+        runs.append((number, number, rng.choices(slips, (7, 6, 4, 3))))
+    return substitute(example, runs)
+
+
+def numbered(example: Example, rng: random.Random) -> Example:
+    """Return an example with figures of names and quantities as words, or words as figures."""
+    free = {n for span in spans(example) if span.role in values.FREE for n in range(span.first, span.last + 1)}
+    runs: list[tuple[int, int, Sequence[str]]] = []
+    words = example.words
+    for number in sorted(pointed(example) - free):
+        if number >= example.own or rng.random() < 0.3:
+            continue
+        word = words[number]
+        beside = {words[number - 1] if number else "", words[number + 1] if number + 1 < example.own else ""}
+        if any(each in _OF_NUMBERS or each.isdigit() for each in beside):
+            continue  # part of a longer number
+        if word.isdigit() and int(word) <= 20 and not word.startswith("0"):
+            runs.append((number, number, (_NUMBER_WORDS[int(word)],)))
+        elif word in _NUMBER_WORDS and word != "one":
+            runs.append((number, number, (str(_NUMBER_WORDS.index(word)),)))
+    return substitute(example, runs)
+
+
+def articles(example: Example, rng: random.Random) -> Example:
+    """Return an example with some articles left out, as in telegrams and by people whose language has none."""
+    kept = pointed(example)
+    runs: list[tuple[int, int, Sequence[str]]] = [
+        (number, number, () if rng.random() < 0.7 else (rng.choice(("the", "that", "this", "a")),))
+        for number, word in enumerate(example.words[: example.own])
+        if number not in kept and word in ("the", "a", "an") and rng.random() < 0.7
+    ]
+    return substitute(example, runs)
+
+
+def rostered(example: Example, rng: random.Random) -> Example:
+    """Return an example with a roster that has its robots and others, or without one."""
+    robots = _robots(example)
+    if any(span.first >= example.own for span in spans(example)) or "all" in robots:
+        return example
+    if len(example.words) > example.own:
+        return replace(example, words=example.words[: example.own])
+    if any(each.endswith("+") for each in robots):
+        return example
+    named = [each for each in robots if not ANY.fullmatch(each)]
+    others = [
+        f"{rng.choice(('robot', 'unit', 'scout', 'bot', 'kit', 'arm'))}_{rng.randrange(1, 30)}"
+        for _ in range(rng.randrange(4))
+    ]
+    roster = [*named, *(each for each in dict.fromkeys(others) if each not in named)]
+    rng.shuffle(roster)
+    return (
+        replace(example, words=(*example.words, *roster))
+        if all(re.fullmatch(r"[\w.-]+", each) for each in roster)
+        else example
+    )
+
+
+_CHANGES: tuple[tuple[float, Callable[[Example, random.Random], Example]], ...] = (
+    (0.35, numbered),
+    (0.25, unmarked),
+    (0.3, talkative),
+    (0.25, misspelt),
+    (0.15, articles),
+    (0.2, rostered),
+)

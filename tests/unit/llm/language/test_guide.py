@@ -1,0 +1,76 @@
+"""The guide of the plan language: whatever follows it is a plan, and every plan follows it."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.llm import corpus
+from appliance.llm.corpus.notation import parse
+from appliance.llm.language.codec import Answer, read, write
+from appliance.llm.language.guide import END, Guide
+from appliance.llm.language.words import words_of
+from appliance.skills.catalogue import load_catalogue
+
+CATALOGUE = load_catalogue()
+FILES = sorted(Path(corpus.__file__).parent.glob("*.plan"))
+INSTRUCTIONS = (
+    "Rex, fetch the drill from bay two and film it for half a minute.",
+    "robots 1 and 2 meet at dock 3",
+    "what is love",
+    "?",
+    "stop",
+)
+
+
+@settings(deadline=None)
+@given(st.data(), st.sampled_from(INSTRUCTIONS), st.sampled_from([None, (), ("rex",), ("robot_1", "robot_2", "kit_3")]))
+def test_whatever_follows_it_is_a_plan(data: st.DataObject, instruction: str, robots: tuple[str, ...] | None) -> None:
+    """Any walk along what is allowed comes to an end that reads as an answer whose robots are of the roster."""
+    words = words_of(instruction, robots or ())
+    guide = Guide(words, CATALOGUE, robots=robots)
+    symbols: list[str] = []
+    while not guide.ended:
+        allowed = guide.allowed()
+        assert allowed, symbols
+        assert len(set(allowed)) == len(allowed)
+        # Long walks show nothing new: an end is taken sooner or later.
+        symbol = END if END in allowed and len(symbols) > 12 else data.draw(st.sampled_from(allowed))
+        if len(symbols) > 80:
+            symbol = next((each for each in (END, "]", "|") if each in allowed), symbol)
+        guide.take(symbol)
+        symbols += [symbol] if symbol != END else []
+    answer = read(symbols, words, CATALOGUE)
+    assert answer.refused or answer.subtasks
+    for subtask in answer.subtasks:
+        manifest = CATALOGUE.skills[subtask.skill]
+        assert all(name in subtask.params for name, param in manifest.params.items() if param.required)
+        if robots is not None and subtask.robot is not None and not subtask.robot.startswith("any"):
+            assert subtask.robot in robots
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
+def test_the_corpus_follows_it(file: Path) -> None:
+    """Every plan of the corpus that needs no literal may be said, with its roster and without one."""
+    for pair in parse(file.read_text()).values():
+        words = words_of(pair.instruction, pair.robots)
+        answer = Answer(domain=pair.domain, subtasks=pair.subtasks, refused=pair.refused)
+        symbols = write(answer, words, CATALOGUE)
+        if any(each.startswith('"') for each in symbols):
+            continue
+        guide = Guide(words, CATALOGUE, robots=pair.robots or None)
+        for symbol in (*symbols, END):
+            allowed = guide.allowed()
+            if symbol not in allowed and symbol.replace(".", "").isdigit():
+                break  # a number that no words mean
+            assert symbol in allowed, (pair.instruction, symbols, symbol)
+            guide.take(symbol)
+
+
+def test_skills_a_planner_does_not_know_are_not_offered() -> None:
+    """A planner is offered only what it has symbols for."""
+    guide = Guide(words_of("hold"), CATALOGUE, robots=None, known=frozenset({"hold", "duration_s:", "navigation"}))
+    assert guide.allowed() == ["none", "navigation"]
+    guide.take("navigation")
+    assert guide.allowed() == ["hold"]
