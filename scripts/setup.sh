@@ -30,7 +30,7 @@ done
 
 PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
   python3 python3-venv rsync ca-certificates)
-[ "$MODE" = dev ] && PACKAGES+=(systemd)
+[ "$MODE" = dev ] && PACKAGES+=(systemd iproute2)  # iproute2: tests in network namespaces of their own
 API_STALE=
 RANGE=65536           # ids that a rootless container may use
 NEED_FRESH_MB=4000    # environment, its downloads, images: measured 2.6 GB, and room to work

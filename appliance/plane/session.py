@@ -25,6 +25,7 @@ from appliance.plane import link
 from appliance.plane.keys import Keys
 from appliance.plane.queues import Inbox, Outbox
 from appliance.plane.settings import PlaneConfig
+from appliance.plane.sockets import SocketWatch
 
 log = structlog.get_logger(__name__)
 
@@ -86,6 +87,8 @@ class Session:
         self._asking: set[asyncio.Future[bytes]] = set()
         self._tokens: set[zenoh.LivelinessToken] = set()
         self._closed = False
+        self._sockets = SocketWatch(config.lease_ms)
+        self._sockets.start()
 
     @classmethod
     async def open(cls, config: PlaneConfig, fleet: str) -> "Session":
@@ -460,4 +463,5 @@ class Session:
         if self._bulk is not None:
             await asyncio.to_thread(self._bulk.close, _CLOSE_S)
         await asyncio.to_thread(self._raw.close)
+        self._sockets.close()
         self._inbox.close()

@@ -1,0 +1,78 @@
+"""Network faults between gateways, each in a network namespace of its own: losses, delays, cuts and what holds.
+
+The namespaces are made without being root, in a user namespace; where the machine forbids that, these tests fail and
+say why. Faults are made by a wire of the project's own between the namespaces, frame by frame, since `tc netem` is not
+in every kernel. Each run is the benchmark's command, which goes into the namespaces by itself.
+"""
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.bench.net import space
+
+pytestmark = [pytest.mark.anyio, pytest.mark.fleet, pytest.mark.timeout(420)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def namespaces() -> None:
+    """Fail, with the reason, where no namespaces can be made."""
+    if reason := space.problem():
+        pytest.fail(f"network faults cannot be tested here: {reason}")
+
+
+async def bench(*arguments: str) -> dict[str, Any]:
+    """Run a benchmark and return its result, whether its invariants held or not."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "appliance.cli", "bench", *arguments, "--json",
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        out, problems = await process.communicate()
+    except BaseException:
+        process.terminate()
+        await process.wait()
+        raise
+    print(problems.decode())
+    assert process.returncode in (0, 1), problems.decode()
+    return json.loads(out)
+
+
+async def test_answers_with_a_quorum_are_right_on_a_bad_network() -> None:
+    """Losses, delays, a one-way cut and a partition: histories stay linearizable, and the fleet is whole afterwards."""
+    result = await bench(
+        "history", "--gateways", "4", "--clients", "4", "--keys", "4", "--every-s", "0",
+        "--faults", "loss,delay,oneway,partition", "--fault-s", "5", "--rest-s", "3",
+    )  # fmt: skip
+    assert result["held"], result
+    assert result["frames"]["lost"] > 0
+    assert result["frames"]["delayed"] > 0
+    assert result["frames"]["cut"] > 0
+    assert result["operations"]["cas"]["ok"] > 0
+
+
+async def test_replicas_agree_after_a_partition() -> None:
+    """Without a quorum both sides write on; healed, all replicas are equal and know of every acknowledged write."""
+    result = await bench(
+        "history", "--gateways", "4", "--clients", "4", "--keys", "4", "--every-s", "0", "--no-quorum",
+        "--faults", "oneway,partition", "--fault-s", "5", "--rest-s", "3",
+    )  # fmt: skip
+    assert result["held"], result
+    assert result["frames"]["cut"] > 0
+
+
+@pytest.mark.podman
+async def test_tasks_are_not_lost_or_doubled_on_a_bad_network(built: None, tmp_path: Path) -> None:
+    """Losses, a one-way cut and a partition while tasks run: all succeed, and each effect is there once."""
+    result = await bench(
+        "chaos", "--gateways", "4", "--tasks", "10", "--faults", "loss,oneway,partition", "--fault-s", "8",
+        "--rest-s", "4", "--keep", str(tmp_path / "chaos"),
+    )  # fmt: skip
+    assert result["broken"] == [], result
+    assert result["tasks"]["states"] == {"succeeded": 10}
+    assert result["effects"]["lines"] == result["effects"]["wanted"]
+    assert result["frames"]["cut"] > 0
