@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.plane.cadence import MEMORY_S, Cadence, Rate, bounds, heartbeat_s, interval_s
@@ -17,6 +17,7 @@ def interval(volatility: float, demand: float, others: int) -> float:
     return interval_s(volatility=volatility, demand=demand, listeners=others, least_s=LEAST, most_s=MOST)
 
 
+@settings(deadline=None)
 @given(rates, rates, listeners, st.floats(1, 10))
 def test_more_volatile_or_more_asked_for_is_sooner_and_more_listeners_later(
     volatility: float, demand: float, others: int, factor: float
@@ -42,6 +43,7 @@ def test_the_interval_costs_least() -> None:
     assert all(cost(best) <= cost(best * other) for other in (0.5, 0.8, 0.99, 1.01, 1.25, 2))
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(0.001, 3), max_size=60), st.floats(0, 50), st.integers(0, 300))
 def test_every_change_is_told_in_time_and_messages_stay_apart(gaps: list[float], elsewhere: float, others: int) -> None:
     """Whatever changes is told within the bounds, what waits is told together, and two messages are never too close."""
@@ -82,6 +84,7 @@ def test_a_quiet_thing_is_told_at_once() -> None:
         assert cadence.due(100.0, listeners=others) == 100.0 + bounds(others, least_s=LEAST, most_s=MOST)[0]
 
 
+@settings(deadline=None)
 @given(st.floats(0.1, 50), st.integers(10, 60))
 def test_a_rate_is_learned_and_forgotten(rate: float, seconds: int) -> None:
     """Steady events are counted at about their rate, and after a few memories of silence as none."""
@@ -94,6 +97,7 @@ def test_a_rate_is_learned_and_forgotten(rate: float, seconds: int) -> None:
     assert it.read(end + 10 * MEMORY_S) < 0.01 * rate
 
 
+@settings(deadline=None)
 @given(listeners)
 def test_idle_fleets_stay_quiet(others: int) -> None:
     """At rest nobody hears more than ten repetitions a second, and a small fleet repeats every two seconds."""

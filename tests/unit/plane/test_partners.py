@@ -1,6 +1,6 @@
 """Whom a gateway compares its records with: everybody who may hold what it must hold now, and in a large fleet few."""
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.plane.partners import partners, sharing
@@ -10,6 +10,7 @@ fleets = st.sets(st.integers(0, 30).map(lambda number: f"g{number}"), max_size=1
 keys = [f"key/{number}" for number in range(300)]
 
 
+@settings(deadline=None)
 @given(fleets, fleets, st.integers(1, 4), st.integers(1, 8))
 def test_all_that_may_hold_what_is_new_are_compared_with(
     before: set[str], now: set[str], replicas: int, points: int
@@ -25,6 +26,7 @@ def test_all_that_may_hold_what_is_new_are_compared_with(
             assert {*holding, *held} & new.members - {"g0"} <= found
 
 
+@settings(deadline=None)
 @given(fleets, st.integers(1, 4), st.integers(1, 8))
 def test_nothing_new_nobody_asked(fleet: set[str], replicas: int, points: int) -> None:
     """A ring that has not changed, or from which only the keys of others moved, asks for no comparison."""
@@ -33,6 +35,7 @@ def test_nothing_new_nobody_asked(fleet: set[str], replicas: int, points: int) -
     assert partners(ring, ring.with_member("joiner"), "g0", replicas) == frozenset()
 
 
+@settings(deadline=None)
 @given(fleets, st.integers(1, 4), st.integers(1, 8))
 def test_sharing_is_mutual(fleet: set[str], replicas: int, points: int) -> None:
     """Whoever holds copies of the same keys is found, by both."""

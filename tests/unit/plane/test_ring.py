@@ -3,7 +3,7 @@
 from collections import Counter
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.errors import UnreachableError
@@ -88,6 +88,7 @@ def test_an_empty_ring_says_so() -> None:
         Ring([], virtual_nodes=8).owner("key")
 
 
+@settings(deadline=None)
 @given(members, members, st.integers(1, 8))
 def test_a_changed_ring_is_the_same_as_one_made_anew(before: set[str], after: set[str], points: int) -> None:
     """However many come and go, the points and whose they are do not depend on what the ring was made from."""
