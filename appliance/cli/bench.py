@@ -418,6 +418,69 @@ def members(
 
 
 @bench_app.command
+def restart(
+    *,
+    gateways: int = 8,
+    rounds: int = 20,
+    records: int = 200,
+    how: Literal["stop", "kill"] = "stop",
+    lease_ms: int = 1000,
+    as_json: Json = False,
+) -> int:
+    """A gateway is restarted again and again: how soon after its session is open it is back in the ring.
+
+    Args:
+        gateways: Processes on this machine.
+        rounds: Restarts of one of them.
+        records: In the ring meanwhile.
+        how: Stopped with SIGTERM, or killed.
+        lease_ms: `plane.lease_ms` of all.
+    """
+    from appliance.bench.failover.restart import Options, run
+
+    options = Options(gateways=gateways, rounds=rounds, records=records, how=how, lease_ms=lease_ms)
+    tell(measure(run(options, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
+def takeover(
+    *,
+    gateways: int = 8,
+    kills: int = 10,
+    freezes: int = 5,
+    tasks: int = 8,
+    sleep_ms: float = 3000.0,
+    lease_ms: int = 1000,
+    image: str = "base",
+    as_json: Json = False,
+) -> int:
+    """Coordinators of running tasks are killed and frozen: how soon it is noticed, and another goes on.
+
+    Ends with 1 when a task did not succeed, or a subtask ended more than once.
+
+    Args:
+        gateways: Processes on this machine.
+        kills: Coordinators that get SIGKILL, one after the other.
+        freezes: Coordinators that get SIGSTOP, and SIGCONT once they were succeeded.
+        tasks: Under way at the same time.
+        sleep_ms: What the first of a task's two subtasks works.
+        lease_ms: `plane.lease_ms` of all: after so long silence a gateway counts as gone.
+        image: Image of the containers.
+    """
+    from appliance.bench.failover.takeover import Options, run
+
+    options = Options(
+        gateways=gateways, kills=kills, freezes=freezes, tasks=tasks, sleep_ms=sleep_ms, lease_ms=lease_ms,
+        image=image,
+    )  # fmt: skip
+    result = measure(run(options, progress=say))
+    tell(result, as_json=as_json)
+    wrong = [each for how in ("kill", "freeze") if how in result for each in result[how]["not_exactly_once"]]
+    return 1 if wrong else 0
+
+
+@bench_app.command
 def policy(
     *,
     traces: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),

@@ -93,7 +93,10 @@ class Plane:
         self.milestones[milestone] = now = time.monotonic()
         if milestone == "reconciled":
             opened = self.milestones.get("session", now)
-            log.info("back in the ring", gateway=self.gateway, after_open_ms=round((now - opened) * 1e3, 1))
+            after_ms = {
+                f"{name}_ms": round((at - opened) * 1e3, 2) for name, at in self.milestones.items() if at > opened
+            }
+            log.info("back in the ring", gateway=self.gateway, session_opened_s=round(opened, 6), **after_ms)
 
     @classmethod
     async def open(cls, config: PlaneConfig, *, fleet: str, gateway: str, data_dir: Path) -> "Plane":

@@ -1,0 +1,1 @@
+"""How fast a fleet is whole again: a gateway that is restarted (`restart`), a root that is lost (`takeover`)."""

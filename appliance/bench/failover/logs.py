@@ -1,0 +1,56 @@
+"""What gateways write into their logs, read as it comes: they say there when they have reached what is measured."""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from appliance.errors import DeadlineError
+
+_LOOK_S = 0.005
+
+
+class LogTail:
+    """The lines of a log file from where it ends now, decoded; lines that are no JSON are left out."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._at = path.stat().st_size if path.exists() else 0
+        self._rest = b""
+
+    def read(self) -> list[dict[str, Any]]:
+        """The lines that have come since."""
+        if not self._path.exists():
+            return []
+        with self._path.open("rb") as file:
+            file.seek(self._at)
+            found = file.read()
+        self._at += len(found)
+        *lines, self._rest = (self._rest + found).split(b"\n")
+        decoded: list[dict[str, Any]] = []
+        for line in lines:
+            try:
+                each = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(each, dict):
+                decoded.append(each)  # pyright: ignore[reportUnknownArgumentType]
+        return decoded
+
+    async def until(self, wanted: Callable[[dict[str, Any]], bool], what: str, *, wait_s: float) -> dict[str, Any]:
+        """The next line that is wanted; DeadlineError, which says what was awaited, after `wait_s` seconds."""
+        give_up = time.monotonic() + wait_s
+        while time.monotonic() < give_up:
+            for line in self.read():
+                if wanted(line):
+                    return line
+            await asyncio.sleep(_LOOK_S)
+        raise DeadlineError(f"{what}: not in {self._path} within {wait_s:g} s", remedy="see the end of that file")
+
+
+def wall_s(line: dict[str, Any]) -> float:
+    """When a line was written, Unix seconds of the machine that all processes share."""
+    return datetime.fromisoformat(str(line["timestamp"])).timestamp()

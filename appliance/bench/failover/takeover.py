@@ -1,0 +1,249 @@
+"""Gateways that coordinate running tasks are killed, and frozen: how soon it is noticed, and who goes on.
+
+A killed process is noticed by its connections, at once; a frozen one (SIGSTOP, a machine that hangs) by its silence,
+after `plane.lease_ms`. Survivors say in their logs when they lost it; the successor's transition `adopted` says that
+it drives the task, once the record with it is written. In the end each task must have succeeded, and each subtask
+must have ended exactly once.
+"""
+
+import asyncio
+import signal
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from msgspec import Struct
+
+from appliance.bench.chaos.arena import Arena, Progress, loopback
+from appliance.bench.failover.logs import LogTail, wall_s
+from appliance.bench.figures import summary
+from appliance.bench.pooled import SKILL, fleet_name, write_skill
+from appliance.client import FleetClient
+from appliance.config import GatewayConfig
+from appliance.errors import DeadlineError, SwiftbotError
+from appliance.llm.settings import LlmConfig
+from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.settings import PoolConfig
+from appliance.tasks.machine import Transition, TransitionKind
+
+STEP_S = 120.0
+GOAL_MS = 1000.0
+_PARAMETER = """
+retries = 5
+
+[params.service_ms]
+type = "number"
+required = true
+"""
+
+
+class Options(Struct, frozen=True, kw_only=True):
+    """What to measure."""
+
+    gateways: int = 8
+    kills: int = 10
+    freezes: int = 5
+    tasks: int = 8
+    """Under way at the same time, of two subtasks each."""
+    sleep_ms: float = 3000.0
+    lease_ms: int = 1000
+    image: str = "base"
+
+
+class Heard:
+    """The transitions of all tasks as they are published, with when they came."""
+
+    def __init__(self, client: FleetClient) -> None:
+        self.all: list[tuple[float, Transition]] = []
+        self.came = asyncio.Event()
+        session = client.plane.session
+        self._closer = session.subscribe_typed(session.keys.transition(), Transition, self._take)
+
+    def _take(self, _: str, transition: Transition | None) -> None:
+        if transition is not None:
+            self.all.append((time.time(), transition))
+            self.came.set()
+
+    def adopted(self, task: str, not_by: str) -> tuple[float, Transition] | None:
+        """When a task was first taken over by another gateway, on the wall clock of this machine."""
+        for at, each in self.all:
+            if each.task == task and each.kind is TransitionKind.ADOPTED and each.coordinator != not_by:
+                return at, each
+        return None
+
+    def ends(self, tasks: Sequence[str]) -> Counter[tuple[str, str]]:
+        """How often each subtask of these tasks has succeeded."""
+        return Counter(
+            (each.task, each.subtask)
+            for _, each in self.all
+            if each.task in tasks and each.kind is TransitionKind.SUCCEEDED
+        )
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._closer.close()
+
+
+async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
+    """Measure kills, then freezes; all processes and containers are gone afterwards.
+
+    Returns:
+        For `kill` and `freeze`: `detected` by the successor and `detected_by_all`, ms after the signal; `adopted`, ms
+        after the successor's detection; and counts of tasks.
+    """
+    result: dict[str, Any] = {"gateways": options.gateways, "lease_ms": options.lease_ms, "goal_ms": GOAL_MS}
+    with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
+        skills = write_skill(Path(folder), options.image, more=_PARAMETER)
+        base = GatewayConfig(
+            id="gw-1", llm=LlmConfig(tiers=("rules",)), plane=PlaneConfig(lease_ms=options.lease_ms), drain_s=5.0
+        )
+        arena = Arena(
+            fleet=fleet_name(), directory=Path(folder) / "fleet", sites=loopback(options.gateways), base=base,
+            pool=PoolConfig(floor={options.image: 1}, capacity=3), skills=skills,
+        )  # fmt: skip
+        try:
+            await arena.start_all(progress=progress, ready=1)
+            async with await arena.client() as client:
+                for how, rounds in (("kill", options.kills), ("freeze", options.freezes)):
+                    if rounds:
+                        result[how] = await _Rounds(options, arena, client, progress).run(how, rounds)
+        finally:
+            await arena.stop(progress=progress)
+    return result
+
+
+class _Rounds:
+    def __init__(self, options: Options, arena: Arena, client: FleetClient, progress: Progress) -> None:
+        self._options = options
+        self._arena = arena
+        self._client = client
+        self._progress = progress
+
+    async def run(self, how: Literal["kill", "freeze"], rounds: int) -> dict[str, Any]:
+        """Lose so many coordinators, one after the other."""
+        heard = Heard(self._client)
+        detected: list[float] = []
+        by_all: list[float] = []
+        adopted: list[float] = []
+        tasks = 0
+        problems: list[str] = []
+        for number in range(rounds):
+            names = await self._submit(f"{how}-{number}")
+            records = await self._running(names)
+            roots = Counter(each.coordinator for each in records)
+            victim = roots.most_common(1)[0][0]
+            theirs = [each.id for each in records if each.coordinator == victim]
+            tails = {
+                name: LogTail(self._arena.directory / "logs" / f"{name}.log")
+                for name in self._arena.names
+                if name != victim
+            }
+            at = time.time()
+            if how == "kill":
+                await self._arena.kill(victim)
+            else:
+                self._arena.signal(victim, signal.SIGSTOP)
+            lost = await self._lost(tails, victim)
+            by_all.append((max(lost.values()) - at) * 1e3)
+            for task in theirs:
+                adopted_at, transition = await self._adopted(heard, task, victim)
+                seen_at = lost[transition.coordinator]
+                detected.append((seen_at - at) * 1e3)
+                adopted.append((adopted_at - seen_at) * 1e3)
+            self._progress(
+                f"{how} {number + 1} of {rounds}: {victim} with {len(theirs)} tasks, seen after {by_all[-1]:.0f} ms, "
+                f"adopted {adopted[-1]:.0f} ms later"
+            )
+            if how == "freeze":
+                self._arena.signal(victim, signal.SIGCONT)
+            problems += await self._ended(heard, names)
+            tasks += len(names)
+            if how == "kill":
+                self._arena.start(victim)
+            await self._arena.settled(self._client, ready=0)
+        heard.close()
+        return {
+            "rounds": rounds,
+            "tasks": tasks,
+            "tasks_taken_over": len(adopted),
+            "not_exactly_once": problems,
+            "detected": summary(detected),
+            "detected_by_all": summary(by_all),
+            "adopted_after_detection": summary(adopted),
+        }
+
+    async def _submit(self, prefix: str) -> list[str]:
+        steps = (
+            Subtask(id="s1", skill=SKILL, params={"service_ms": self._options.sleep_ms}),
+            Subtask(id="s2", skill=SKILL, params={"service_ms": 0.0}, after=("s1",)),
+        )
+        names = [f"{prefix}-{number}" for number in range(self._options.tasks)]
+        for name in names:
+            plan = Plan(domain="coordination", subtasks=steps)
+            await self._client.submit(TaskRequest(id=name, instruction=name, plan=plan))
+        return names
+
+    async def _running(self, names: list[str]) -> list[TaskRecord]:
+        """Wait until each task has a run under way."""
+        give_up = time.monotonic() + STEP_S
+        while True:
+            records = [await self._client.task(name) for name in names]
+            under_way = [
+                each
+                for each in records
+                if each.subtasks and each.subtasks[0].state is SubtaskState.RUNNING and not each.state.final
+            ]
+            if len(under_way) >= len(names) // 2 or (under_way and time.monotonic() > give_up - STEP_S / 2):
+                return under_way
+            if time.monotonic() > give_up:
+                states = Counter(str(each.state) for each in records)
+                raise DeadlineError(f"the tasks do not run: {dict(states)}", remedy="see the gateways' logs")
+            await asyncio.sleep(0.05)
+
+    async def _lost(self, tails: dict[str, LogTail], victim: str) -> dict[str, float]:
+        """When each survivor noticed."""
+
+        def is_loss(line: dict[str, Any]) -> bool:
+            return line.get("event") == "gateway lost" and line.get("member") == victim
+
+        lines = await asyncio.gather(
+            *(tail.until(is_loss, f"{name} loses {victim}", wait_s=STEP_S) for name, tail in tails.items())
+        )
+        return {name: wall_s(line) for name, line in zip(tails, lines, strict=True)}
+
+    async def _adopted(self, heard: Heard, task: str, victim: str) -> tuple[float, Transition]:
+        try:
+            async with asyncio.timeout(STEP_S):
+                while (found := heard.adopted(task, victim)) is None:
+                    heard.came.clear()
+                    await heard.came.wait()
+        except TimeoutError:
+            raise DeadlineError(f"nobody took {task} over from {victim} within {STEP_S:g} s") from None
+        return found
+
+    async def _ended(self, heard: Heard, names: list[str]) -> list[str]:
+        """Wait for the end of all tasks; returns those that did not succeed once and for all."""
+        give_up = time.monotonic() + STEP_S
+        records: list[TaskRecord] = []
+        for name in names:
+            while True:
+                try:
+                    record = await self._client.task(name)
+                except SwiftbotError as error:
+                    if time.monotonic() > give_up:
+                        raise DeadlineError(f"{name} cannot be read: {error}") from error
+                else:
+                    if record.state.final:
+                        break
+                    if time.monotonic() > give_up:
+                        raise DeadlineError(f"{name} did not end: {record.state}", remedy="see the gateways' logs")
+                await asyncio.sleep(0.1)
+            records.append(record)
+        await asyncio.sleep(0.2)  # what was published with the last records arrives
+        ends = heard.ends(names)
+        wrong = [f"{each.id} {each.state}" for each in records if each.state is not TaskState.SUCCEEDED]
+        return wrong + [f"{task}/{subtask} ended {times} times" for (task, subtask), times in ends.items() if times > 1]
