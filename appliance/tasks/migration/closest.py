@@ -19,7 +19,7 @@ from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need
 from appliance.tasks.migration.api import Weighed
 from appliance.tasks.migration.settings import MigrationConfig
 
-NEARLY = 0.1
+NEARLY = 0.05
 """Scores closer together than this say nothing: loads are a second old."""
 REMEMBERED = 8
 """Moves remembered of each gateway."""

@@ -1,0 +1,204 @@
+"""A partition of a real fleet: both halves go on, and when they meet the records merge and doubled runs are ended.
+
+Gateways are clients of two routers whose only link goes through a relay of the test, which cuts it and mends it.
+"""
+
+import asyncio
+import contextlib
+import os
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from moving_bench import counting, ended, pretty, write_skills
+
+from appliance import config as configuration
+from appliance.client import Endpoint, FleetClient
+from appliance.config import GatewayConfig
+from appliance.local_fleet import free_port
+from appliance.model import Notice, TaskState
+from appliance.plane.settings import PlaneConfig
+from appliance.pool.engine import remove_fleet
+from appliance.pool.settings import PoolConfig
+from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.settings import TasksConfig
+
+pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
+
+NAMES = ("gw-1", "gw-2", "gw-3", "gw-4")
+
+
+class Relay:
+    """Passes bytes between whoever connects and a port, until it is cut; then nothing, until it is mended."""
+
+    def __init__(self, port: int, to: int) -> None:
+        self._port, self._to = port, to
+        self._server: asyncio.Server | None = None
+        self._links: set[asyncio.StreamWriter] = set()
+
+    async def mend(self) -> None:
+        """Listen."""
+        self._server = await asyncio.start_server(self._link, "127.0.0.1", self._port)
+
+    async def cut(self) -> None:
+        """Break all links and take no new ones."""
+        if self._server is not None:
+            self._server.close()
+            for writer in self._links:
+                writer.transport.abort()
+            await self._server.wait_closed()
+            self._server = None
+
+    async def _link(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            other_reader, other_writer = await asyncio.open_connection("127.0.0.1", self._to)
+        except OSError:
+            writer.close()
+            return
+        self._links |= {writer, other_writer}
+        try:
+            await asyncio.gather(self._pass(reader, other_writer), self._pass(other_reader, writer))
+        finally:
+            self._links -= {writer, other_writer}
+
+    @staticmethod
+    async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            while data := await reader.read(65536):
+                writer.write(data)
+                await writer.drain()
+        writer.close()
+
+
+@asynccontextmanager
+async def process(folder: Path, name: str, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A process of the command line, its output in a file, ended afterwards."""
+    with (folder / f"{name}.log").open("ab") as log:
+        it = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "appliance.cli", *arguments, stdout=log, stderr=log
+        )
+    try:
+        yield it
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            it.terminate()
+        try:
+            async with asyncio.timeout(40):
+                await it.wait()
+        except TimeoutError:
+            it.kill()
+            await it.wait()
+
+
+@asynccontextmanager
+async def halves(folder: Path) -> AsyncIterator[tuple[Relay, FleetClient, FleetClient]]:
+    """Two gateways at each of two routers; a client at each router."""
+    fleet = f"p{os.getpid()}-{time.monotonic_ns() % 100000}"
+    one, other, between = free_port(), free_port(), free_port()
+    relay = Relay(between, one)
+    skills = write_skills(folder)
+    async with contextlib.AsyncExitStack() as stack:
+        stack.push_async_callback(remove_fleet, fleet)
+        await relay.mend()
+        stack.push_async_callback(relay.cut)
+        ends = [f"tcp/127.0.0.1:{port}" for port in (one, other)]
+        await stack.enter_async_context(process(folder, "router-1", "router", "--listen", ends[0]))
+        linked = ("--connect", f"tcp/127.0.0.1:{between}")
+        await stack.enter_async_context(process(folder, "router-2", "router", "--listen", ends[1], *linked))
+        for port in (one, other):
+            await until_listening(port)
+        for number, name in enumerate(NAMES):
+            config = GatewayConfig(
+                id=name,
+                fleet=fleet,
+                data_dir=str(folder / name),
+                skills=(str(skills),),
+                drain_s=1.0,
+                keep_containers=False,
+                plane=PlaneConfig(mode="client", connect=(ends[number // 2],)),
+                pool=PoolConfig(floor={"base": 2}, capacity=6),
+                tasks=TasksConfig(migration=MigrationConfig(cpu_high=0.0)),
+            )
+            path = folder / f"{name}.toml"
+            path.write_text(configuration.dump(config))
+            await stack.enter_async_context(process(folder, name, "gateway", "--config", str(path)))
+        clients = [await stack.enter_async_context(FleetClient(Endpoint(fleet=fleet, connect=(end,)))) for end in ends]
+        await until_seen(clients[0], set(NAMES), ready=1)
+        await until_seen(clients[1], set(NAMES), ready=1)
+        yield relay, clients[0], clients[1]
+
+
+async def until_listening(port: int) -> None:
+    """Wait until somebody takes connections at a port."""
+    async with asyncio.timeout(60):
+        while True:
+            with contextlib.suppress(OSError):
+                _, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.close()
+                return
+            await asyncio.sleep(0.1)
+
+
+async def until_seen(client: FleetClient, names: set[str], *, ready: int = 0) -> None:
+    """Wait until a client sees these gateways and no others."""
+    async with asyncio.timeout(90):
+        while True:
+            known = client.plane.registry.gateways
+            if client.plane.members() == names and all(
+                name in known and known[name].ready + known[name].running >= ready for name in names
+            ):
+                return
+            await asyncio.sleep(0.1)
+
+
+async def test_both_halves_go_on_and_meet_again(tmp_path: Path) -> None:
+    """Tasks that run while the link is cut end once; each half takes new ones; doubled runs are ended and told of."""
+    async with halves(tmp_path) as (relay, here, there):
+        notices: asyncio.Queue[Notice] = asyncio.Queue()
+        here.on_notice(notices)
+        tasks = [f"t-cut-{number}" for number in range(6)]
+        for task in tasks:
+            await here.submit(counting(task, steps=250, step_s=0.1))
+        async with asyncio.timeout(60):
+            while sum(each.running for each in here.plane.registry.gateways.values()) < len(tasks):
+                await asyncio.sleep(0.1)
+        await relay.cut()
+        await until_seen(here, set(NAMES[:2]))
+        await until_seen(there, set(NAMES[2:]))
+        # Each half finishes what is new there.
+        for client, task in ((here, "t-here"), (there, "t-there")):
+            await client.submit(counting(task, steps=3))
+            assert (await ended(client, task)).state is TaskState.SUCCEEDED
+        # Each takes over what the other coordinated, and repeats what ran there.
+        async with asyncio.timeout(60):
+            while not any([await doubled(here, there, task) for task in tasks]):
+                await asyncio.sleep(0.2)
+        await relay.mend()
+        await until_seen(here, set(NAMES))
+        await until_seen(there, set(NAMES))
+        for task in (*tasks, "t-here", "t-there"):
+            last = await ended(here, task)
+            assert last.state is TaskState.SUCCEEDED, pretty(last)
+            assert last.subtasks[0].result, pretty(last)
+        # Nothing of the version that lost goes on, and all gateways have the same records.
+        async with asyncio.timeout(60):
+            while any(each.running or each.queue for each in here.plane.registry.gateways.values()):
+                await asyncio.sleep(0.2)
+            while not (found := [each for each in [await here.task(task) for task in tasks] if each.splits]) or any(
+                not split.settled for each in found for split in each.splits
+            ):
+                await asyncio.sleep(0.2)
+        assert [await here.task(task) for task in tasks] == [await there.task(task) for task in tasks]
+        notes = [split.note for each in found for split in each.splits if split.note]
+        assert any("doubled" in note for note in notes), [pretty(each) for each in found]
+        told = [notices.get_nowait() for _ in range(notices.qsize())]
+        assert any("partition" in each.text for each in told), told
+
+
+async def doubled(here: FleetClient, there: FleetClient, task: str) -> bool:
+    """Whether a task has a run of its own in each half."""
+    one, other = await here.task(task), await there.task(task)
+    return one.subtasks[0].gateway in NAMES[:2] and other.subtasks[0].gateway in NAMES[2:]
