@@ -81,6 +81,15 @@ async def test_frames_of_a_run(zygote: Zygote) -> None:
     assert not Path(result["scratch"]).exists()
 
 
+async def test_the_last_frame_tells_what_the_run_used(zygote: Zygote) -> None:
+    """CPU time and memory at the most come with the result, and from the zygote for a run that was killed."""
+    for do in ("echo", "segv"):
+        last = (await _run(zygote, do))[-1]
+        assert last["cpu_ms"] >= 0
+        assert 1 < last["peak_mb"] < 4096
+        await _wait_free(zygote)
+
+
 async def test_runs_do_not_see_each_other(zygote: Zygote) -> None:
     """What a handler keeps in its module is gone with its child."""
     results = [(await _run(zygote, "echo"))[-1]["result"] for _ in range(3)]
