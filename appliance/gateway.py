@@ -7,10 +7,12 @@ hand over coordination (the next owner of each key goes on), leave the warm cont
 
 import asyncio
 import contextlib
+import functools
 import os
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -34,6 +36,7 @@ from appliance.model import (
 )
 from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
+from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
 from appliance.pool.state import ALONE, State
 from appliance.pool.storage import PodmanStorage
@@ -168,6 +171,7 @@ class Gateway:
             decomposer=self.decomposer,
             executor=self.executor,
             site=site,
+            image_of=self._image_names(catalogue),
         )
         self.manager.on_change = self._changed.set
         self.manager.recovery.on_published = self._kept.hear_transition
@@ -193,6 +197,16 @@ class Gateway:
         for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
             self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
+
+    def _image_names(self, catalogue: Catalogue) -> Callable[[str], str]:
+        """Return what gives the full reference of an image; each is worked out once, from what goes into it."""
+
+        @functools.cache
+        def name(image: str) -> str:
+            spec = catalogue.images.get(image)
+            return reference(spec, self.config.pool) if spec is not None else ""
+
+        return name
 
     async def _open_state(self) -> tuple[State, Links]:
         """Open the ledger of state volumes and the transfers of them and of images; neither without Podman."""
@@ -367,6 +381,7 @@ class Gateway:
             draining=self._draining or self.executor.draining,
             drain=self.migration.draining.text,
             overloaded=self.migration.shedding.reason,
+            catalogue=self.manager.scheduler.digest,
             cores=os.cpu_count() or 0,
             pool_memory_mb=self.config.pool.memory_mb,
             searches=dict(self._remote.searches),

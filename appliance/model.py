@@ -328,6 +328,8 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The gateways that may serve it, as its submitter wished; empty: any."""
     group: Group | None = None
     """None before the first subtask was placed."""
+    note: str = ""
+    """What it must expect, as was seen when it was accepted and when it was planned: a wait, a deadline too near."""
     state: TaskState = TaskState.ACCEPTED
     plan: Plan | None = None
     handed_in: bool = False
@@ -566,6 +568,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """While it drains: how far it is, and what the runs that are left wait for."""
     overloaded: str = ""
     """Why runs are moved away from it, or were lately: it is given none meanwhile. Empty when all is well."""
+    catalogue: str = ""
+    """Digest of the skills it knows (verb `skills`); empty: not told."""
     cores: int = 0
     """Processor cores of the machine; 0: not told."""
     pool_memory_mb: int = 0

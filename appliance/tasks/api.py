@@ -96,6 +96,17 @@ class RunStatus(Struct, frozen=True, kw_only=True):
     """In how many seconds it may have one; None: not known."""
 
 
+class SkillsAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`skills`: which skills does this gateway know?"""
+
+
+class SkillList(Struct, frozen=True, kw_only=True):
+    """The skills that can be run, and the digest of them that stands in the gateway's status."""
+
+    digest: str
+    skills: tuple[str, ...]
+
+
 class ContainerList(Struct, frozen=True, kw_only=True):
     """`find_containers`: ready containers that the asked gateway knows for a need, its own and others'."""
 

@@ -9,6 +9,7 @@ from appliance.errors import NotFoundError
 from appliance.model import Failure, SubtaskRecord, TaskState
 from appliance.tasks import machine
 from appliance.tasks.bounds import MAX_NOTE, clean
+from appliance.tasks.deadline import left_s
 from appliance.tasks.hearing import Hearing
 from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
@@ -45,6 +46,11 @@ class Dispatching:
         if keeper.record.state is TaskState.CANCELLING:
             self._end_runs(now)
             return
+        ready = machine.ready(keeper.record)
+        if any(self._pace.not_before.get(each.subtask.id, 0.0) <= now for each in ready):
+            group = self._around.regroup(keeper.record)
+            if group is not None:
+                keeper.apply(keeper.transition(TransitionKind.GROUPED, group=group))
         for each in machine.ready(keeper.record):
             keeper.ready_ns.setdefault(each.subtask.id, time.monotonic_ns())
             if keeper.record.state is TaskState.RUNNING and self._pace.may_go(each.subtask.id, now):
@@ -80,6 +86,11 @@ class Dispatching:
         if not placement.order:
             self._wait(target, f"waits for a gateway: {placement.why}", now)
             return
+        left = left_s(keeper.record, keeper.elapsed_s)
+        turn = self._around.turn(keeper.record, target, placement, left)
+        if not turn.gateway:
+            self._wait(target, f"waits for room: {', '.join(placement.order)} have enough to do", now)
+            return
         self._pace.goes(subtask.id)
         request = request_for(
             keeper.record,
@@ -89,7 +100,7 @@ class Dispatching:
             coordinator=self._around.plane.gateway,
             elapsed_s=keeper.elapsed_s,
         )
-        gateway = placement.order[0]
+        gateway = turn.gateway
         keeper.apply(
             keeper.transition(
                 TransitionKind.DISPATCHED,

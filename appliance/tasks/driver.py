@@ -19,6 +19,7 @@ import structlog
 from appliance.model import Failure, RunEventKind, SubtaskState, TaskRecord, TaskState, VersionVector
 from appliance.tasks import machine
 from appliance.tasks.checking import Checking
+from appliance.tasks.deadline import left_s, passed
 from appliance.tasks.dispatching import Dispatching
 from appliance.tasks.healing import OVERTAKEN, heal
 from appliance.tasks.hearing import Hearing
@@ -63,6 +64,7 @@ class Driver:
         *,
         on_change: Callable[[TaskRecord], None],
         give_up: Failure | None = None,
+        elapsed_s: float = 0.0,
     ) -> None:
         self._around = around
         self.ended = False
@@ -70,7 +72,7 @@ class Driver:
         self._give_up = give_up
         """Why the task is to be ended instead of driven: earlier drivers of it broke."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
-        self._keeper = Keeper(around.plane, record, version, on_change)
+        self._keeper = Keeper(around.plane, record, version, on_change, elapsed_s)
         self._keeper.on_written = self._written
         self._keeper.on_published = around.recovery.published
         self._orders = Orders(around, self.tell)
@@ -149,6 +151,8 @@ class Driver:
             *self._pace.not_before.values(), self._checking.next_at, *(() if partial_at is None else (partial_at,))
         )  # fmt: skip
         due = [at - now for at in wake_at if at > now]
+        if self.record.state is TaskState.RUNNING:
+            due.append(left_s(self.record, self._keeper.elapsed_s))
         return max(0.01, min([self._around.config.check_s, *due]))
 
     async def _resume(self) -> None:
@@ -171,6 +175,8 @@ class Driver:
     def _advance(self) -> None:
         """Do what follows from the record."""
         now = time.monotonic()
+        if self.record.state is TaskState.RUNNING and left_s(self.record, self._keeper.elapsed_s) <= 0:
+            self._keeper.apply(self._keeper.transition(TransitionKind.CANCEL, failure=passed(self.record)))
         if self.record.state is not TaskState.CANCELLING:
             self._hearing.tell_partials(now)
         self._replanning.advance(now)

@@ -27,7 +27,12 @@ class Keeper:
     """A record, its version, and the transitions that are not written yet."""
 
     def __init__(
-        self, plane: Plane, record: TaskRecord, version: VersionVector, on_change: Callable[[TaskRecord], None]
+        self,
+        plane: Plane,
+        record: TaskRecord,
+        version: VersionVector,
+        on_change: Callable[[TaskRecord], None],
+        elapsed_s: float = 0.0,
     ) -> None:
         self._plane = plane
         self.record = record
@@ -37,7 +42,7 @@ class Keeper:
         self._dirty = False
         self.ready_ns: dict[str, int] = {}
         """When each subtask became ready, on this machine's clock."""
-        self._since = time.monotonic() - record.elapsed_s
+        self._since = time.monotonic() - max(record.elapsed_s, elapsed_s)
         """When the task was accepted, by this machine's monotonic clock."""
         self.on_written: Callable[[], None] = lambda: None
         """The record is written: what follows from it may begin."""

@@ -54,6 +54,7 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
             priority=event.priority,
             deadline_s=event.deadline_s,
             within=event.within,
+            note=event.note,
             plan=event.plan,
             handed_in=event.plan is not None,
             coordinator=event.coordinator,
@@ -96,7 +97,8 @@ def _planned(record: TaskRecord, event: Transition) -> TaskRecord:
         SubtaskRecord(subtask=subtask, state=SubtaskState.WAITING if subtask.after else SubtaskState.READY)
         for subtask in event.plan.subtasks
     )
-    return replace(record, state=TaskState.RUNNING, plan=event.plan, subtasks=subtasks)
+    note = event.note or record.note
+    return replace(record, state=TaskState.RUNNING, plan=event.plan, subtasks=subtasks, note=note)
 
 
 def _plan_failed(record: TaskRecord, event: Transition) -> TaskRecord:

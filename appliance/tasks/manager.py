@@ -9,7 +9,6 @@ all there is to takeover: a dead coordinator's tasks are driven by the next owne
 import asyncio
 import contextlib
 import time
-import uuid
 from collections import Counter
 from collections.abc import Callable, Mapping
 
@@ -22,7 +21,6 @@ from appliance.errors import (
     NotFoundError,
     PayloadError,
     PlanError,
-    RefusedError,
     SwiftbotError,
     UnreachableError,
 )
@@ -30,10 +28,8 @@ from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import PlanContext
 from appliance.llm.validate import validate
 from appliance.model import (
-    HIGHEST_PRIORITY,
-    LONGEST_DEADLINE_S,
-    PLAIN_PRIORITY,
     Failure,
+    Group,
     Plan,
     RunAccepted,
     RunEvent,
@@ -49,21 +45,25 @@ from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
+from appliance.tasks.admission import Ends, checked, expectation, full, longest_s
 from appliance.tasks.agreeing import Agreeing
-from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
-from appliance.tasks.bounds import MAX_DEPTH, MAX_TEXT, clean, read_record, too_deep
+from appliance.tasks.api import PlanAnswer, PlanAsk, SkillsAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.bounds import MAX_TEXT, clean, read_record
 from appliance.tasks.checkpoints import Checkpoint, read_checkpoint, remove_checkpoint
+from appliance.tasks.deadline import Ages
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
 from appliance.tasks.healing import heal, unheard
 from appliance.tasks.keeper import Keeper
+from appliance.tasks.line import Place
 from appliance.tasks.listing import newest_tasks
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.placement import Placement, bind, holds, place
+from appliance.tasks.placement import Placement
 from appliance.tasks.recovery import Recovery
+from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, need_of, task_key
+from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, task_key
 
 log = structlog.get_logger(__name__)
 
@@ -73,7 +73,6 @@ MAX_BREAKS = 6
 """Drivers of one task that may break before it is ended with the reason; with the pauses, half a minute."""
 AGAIN_S = (0.5, 1.5, 4.0)
 """When the shard is looked through again after the ring has changed."""
-MAX_SUBMITTER = 120
 
 
 class TaskManager:
@@ -88,6 +87,7 @@ class TaskManager:
         decomposer: Decomposer,
         executor: Executor,
         site: Site,
+        image_of: Callable[[str], str] = lambda _: "",
     ) -> None:
         self.config = config
         self.plane = plane
@@ -104,14 +104,26 @@ class TaskManager:
         self._healing: dict[str, asyncio.Task[None]] = {}
         self._final: dict[str, VersionVector] = {}
         """Records of the shard known to be final, which need not be decoded at every sweep."""
-        self._ahead = LookAhead(plane, manifest=self.manifest, likely_place=self._likely_place, tell_here=executor.hint)
+        self.scheduler = Scheduler(
+            plane,
+            catalogue,
+            config,
+            records=lambda: [driver.record for driver in self._drivers.values()],
+            wake=self._wake,
+            image_of=image_of,
+        )
+        self._ages = Ages()
+        self._ends = Ends()
+        self._ahead = LookAhead(
+            plane, manifest=self.manifest, likely_place=self.scheduler.likely_place, tell_here=executor.hint
+        )
         self.recovery = Recovery(
             plane,
             catalogue=catalogue,
             decomposer=decomposer,
             site=site,
             durations=self._ahead.durations,
-            busy=self._busy_robots,
+            busy=self.scheduler.busy_robots,
         )
         self._closers: list[Callable[[], None]] = []
         self._stopping = False
@@ -135,9 +147,11 @@ class TaskManager:
         rpc.register("tasks", TasksAsk, self.tasks)
         rpc.register("cancel", TaskAsk, self.cancel)
         rpc.register("cancel_here", TaskAsk, self.cancel_here)
+        rpc.register("skills", SkillsAsk, self.scheduler.skills)
         Agreeing(self.plane, self._drivers, self.task).register()
         news = self.plane.session.subscribe_typed(self.plane.keys.run(), RunEvent, self._on_run_event)
         self._closers.append(news.close)
+        self._closers.append(self.plane.session.subscribe(self.plane.keys.task(), self._ages.hear).close)
         self.plane.on_member_lost.append(self._on_member_lost)
         self.plane.dht.on_ring_change.append(self._sweep.set)
         self.plane.dht.on_ring_change.append(self._sweep_soon)
@@ -165,6 +179,7 @@ class TaskManager:
             each.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         await self._ahead.close()
+        await self.scheduler.close()
 
     # --- submission -----------------------------------------------------------------------------------------
 
@@ -178,7 +193,7 @@ class TaskManager:
             RefusedError: the coordinator is full.
             UnreachableError: no owner could be reached within the time allowed.
         """
-        request = self._checked(request)
+        request = self._check(request)
         until = time.monotonic() + 5.0
         while True:
             owner = self.plane.ring.owner(task_key(request.id))
@@ -193,41 +208,15 @@ class TaskManager:
                 log.info("owner did not answer, asking again", owner=owner, reason=str(error))
                 await asyncio.sleep(0.1)
 
-    def _checked(self, request: TaskRequest) -> TaskRequest:
-        instruction = request.instruction.strip()
-        if not instruction:
-            raise PayloadError("the instruction is empty", remedy="say what is to be done")
-        if len(instruction) > self.config.max_instruction_chars:
-            raise PayloadError(
-                f"the instruction has {len(instruction):,} characters, more than {self.config.max_instruction_chars:,}",
-                remedy="split it, or raise tasks.max_instruction_chars",
-            )
-        if len(request.submitter) > MAX_SUBMITTER:
-            raise PayloadError(f"the submitter's name has more than {MAX_SUBMITTER} characters")
-        if request.plan is not None and any(too_deep(each.params) for each in request.plan.subtasks):
-            raise PayloadError(f"parameters are nested more than {MAX_DEPTH} deep", remedy="write them flat")
-        if not 0 <= request.priority <= HIGHEST_PRIORITY:
-            raise PayloadError(
-                f"priority {request.priority} is none", remedy=f"0 to {HIGHEST_PRIORITY}, {PLAIN_PRIORITY} is plain"
-            )
-        if not 0 <= request.deadline_s <= LONGEST_DEADLINE_S:  # false for what is not a number
-            raise PayloadError(
-                f"a deadline of {request.deadline_s:g} s is none",
-                remedy=f"seconds from now, up to {LONGEST_DEADLINE_S:g}; 0 for none",
-            )
-        for name in request.group:
-            check_name(name, "gateway")
-        task = request.id or f"t-{uuid.uuid4().hex[:10]}"
-        return replace(request, instruction=instruction, id=check_name(task, "task"))
+    def _check(self, request: TaskRequest) -> TaskRequest:
+        return checked(request, self.config)
 
     async def accept(self, request: TaskRequest) -> TaskRecord:
         """Write the record, here and on the replicas, then drive it."""
-        request = self._checked(request)
-        if len(self._drivers) >= self.config.max_tasks:
-            raise RefusedError(
-                f"{self.plane.gateway} already coordinates {len(self._drivers)} unfinished tasks",
-                remedy="wait for some to end, or cancel some",
-            )
+        request = self._check(request)
+        over = len(self._drivers) + 1 - self.config.max_tasks
+        if over > 0:
+            raise full(self.plane.gateway, len(self._drivers), self._ends.retry_after_s(over, time.monotonic()))
         transition = Transition(
             task=request.id,
             sequence=1,
@@ -240,6 +229,7 @@ class TaskManager:
             deadline_s=request.deadline_s,
             within=request.group,
             plan=request.plan,
+            note=self.expect(request.plan, deadline_s=request.deadline_s),
         )
         record = machine.apply(None, transition)
         try:
@@ -261,15 +251,29 @@ class TaskManager:
         if record.id in self._drivers or self._stopping:
             return
         give_up = self._why.get(record.id) if self._breaks[record.id] >= MAX_BREAKS else None
-        driver = Driver(self, record, version, on_change=lambda _: self.on_change(), give_up=give_up)
+        driver = Driver(
+            self,
+            record,
+            version,
+            on_change=self._moved,
+            give_up=give_up,
+            elapsed_s=self._ages.elapsed_s(record),
+        )
         self._drivers[record.id] = driver
         task = asyncio.create_task(driver.run(), name=f"drive {record.id}")
         self._driving[record.id] = task
         task.add_done_callback(lambda done: self._driven(driver, done))
         self.on_change()
 
+    def _moved(self, record: TaskRecord) -> None:
+        self.scheduler.moved(record)
+        self.on_change()
+
     def _driven(self, driver: Driver, done: asyncio.Task[None]) -> None:
         self._drivers.pop(driver.record.id, None)
+        self.scheduler.forget(driver.record.id)
+        if driver.ended:
+            self._ends.ended(time.monotonic())
         self._driving.pop(driver.record.id, None)
         task = driver.record.id
         if not done.cancelled() and (error := done.exception()) is not None:
@@ -365,7 +369,14 @@ class TaskManager:
         for driver in self._drivers.values():
             driver.tell(GatewayLost(gateway))
 
+    def _wake(self, task: str) -> None:
+        """Have a task's driver look again: a subtask of it may go now."""
+        if (driver := self._drivers.get(task)) is not None:
+            driver.tell(Wake())
+
     def _on_fact(self, kind: str) -> None:
+        if kind == "gateway":
+            self.scheduler.line.serve(time.monotonic())
         if kind == "robot":
             for driver in self._drivers.values():
                 if driver.waits:
@@ -385,7 +396,7 @@ class TaskManager:
 
     async def plan_only(self, ask: PlanAsk) -> PlanAnswer:
         """Decompose an instruction against the present roster and site; run nothing."""
-        instruction = self._checked(TaskRequest(instruction=ask.instruction)).instruction
+        instruction = self._check(TaskRequest(instruction=ask.instruction)).instruction
         robots = tuple(sorted(self.plane.registry.robots.values(), key=lambda robot: robot.id))
         outcome = await self._decomposer.plan(PlanContext(instruction=instruction, robots=robots, site=self._site))
         return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts)
@@ -400,45 +411,33 @@ class TaskManager:
 
     def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
         """Choose the robot of a subtask."""
-        skills = self._catalogue.skills
-        manifests = {
-            each.subtask.id: skills[each.subtask.skill] for each in record.subtasks if each.subtask.skill in skills
-        }
-        return bind(
-            target.subtask.robot or "",
-            record.subtasks,
-            robots=self.plane.registry.robots,
-            uses={key: manifest.uses for key, manifest in manifests.items()},
-            verbs={key: manifest.verbs for key, manifest in manifests.items()},
-            busy=self._busy_robots(),
-        )
+        return self.scheduler.bind(record, target)
 
-    def _busy_robots(self) -> frozenset[str]:
-        return frozenset(
-            each.bound_robot
-            for driver in self._drivers.values()
-            for each in machine.active(driver.record)
-            if each.bound_robot
-        )
+    def regroup(self, record: TaskRecord) -> Group | None:
+        """Return the group that a task should have from now on, or None when the present one may stay."""
+        return self.scheduler.regroup(record)
 
     def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
-        """Order the gateways for a subtask by the coarse score."""
-        registry = self.plane.registry
-        need = need_of(self.manifest(target.subtask.skill))
-        registry.asked(need.image)
-        stale_s = {name: late_s for name in self.plane.members() if (late_s := registry.stale_s(name))}
-        for name in stale_s:
-            registry.doubt(name)
-        return place(
-            need,
-            here=self.plane.gateway,
-            gateways={name: status for name, status in registry.gateways.items() if name in self.plane.members()},
-            containers=registry.containers,
-            holds=holds(record, target, need.volumes, registry.gateways),
-            robot=registry.robots.get(robot) if robot else None,
-            avoid=frozenset(each.gateway for each in target.attempts if each.failure),
-            config=self.config,
-            stale_s=stale_s,
+        """Order the members of a task's group for a subtask by the coarse score."""
+        return self.scheduler.place(record, target, robot)
+
+    def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
+        """Return where a ready subtask may go now, or its place among those that wait for room."""
+        return self.scheduler.turn(record, target, placement, left_s)
+
+    def expect(self, plan: Plan | None, *, deadline_s: float, elapsed_s: float = 0.0) -> str:
+        """Say in words what a task must expect: a wait, a deadline that can hardly be met; "" when nothing."""
+        line, work_s = self.scheduler.line, None
+        if plan is not None:
+            durations = self._ahead.durations
+            seen = [each for each in plan.subtasks if durations.seen(each.skill)]  # a guess is no reason to warn
+            work_s = longest_s(plan, {each.id: durations.of(each.skill, each.params) for each in seen})
+        return expectation(
+            waiting=len(line),
+            wait_s=line.expected_s(len(line) + 1),
+            work_s=work_s,
+            deadline_s=deadline_s,
+            elapsed_s=elapsed_s,
         )
 
     async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
@@ -454,13 +453,10 @@ class TaskManager:
         """Tell pools what the subtasks that are not ready will need."""
         self._ahead.plan_moved(record, running_s)
 
-    def _likely_place(self, record: TaskRecord, target: SubtaskRecord) -> str:
-        robot = self.bind(record, target)[0] if target.subtask.robot else None
-        return next(iter(self.place(record, target, robot).order), "")
-
     def took(self, skill: str, duration_ms: float) -> None:
         """Note how long a run that succeeded took."""
         self._ahead.durations.add(skill, duration_ms / 1e3)
+        self.scheduler.line.completions.ended(duration_ms / 1e3)
 
     async def checkpoint(self, task: str, subtask: str) -> Checkpoint | None:
         """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""

@@ -24,6 +24,7 @@ from appliance.model import (
     TaskRecord,
 )
 from appliance.tasks.artifacts import bytes_by_gateway
+from appliance.tasks.groups.capability import lacks
 from appliance.tasks.settings import TasksConfig
 
 _ANY = re.compile(r"any\d{0,2}")
@@ -41,6 +42,10 @@ class Placement(Struct, frozen=True, kw_only=True):
 
     order: tuple[str, ...]
     why: str
+    scores: dict[str, float] = {}
+    """Of those in the order."""
+    excluded: dict[str, str] = {}
+    """Gateways that are no candidates, with the reason."""
 
 
 def place(
@@ -54,6 +59,7 @@ def place(
     avoid: frozenset[str],
     config: TasksConfig,
     stale_s: Mapping[str, float] | None = None,
+    excluded: Mapping[str, str] | None = None,
 ) -> Placement:
     """Order the gateways a subtask could be sent to, best first.
 
@@ -67,30 +73,53 @@ def place(
         avoid: gateways where an attempt at it failed; used only when nothing else is left.
         config: the weights.
         stale_s: for how long a gateway has been silent beyond what it promised, where it has.
+        excluded: gateways that cannot serve it (`groups.capability`), with the reason.
     """
     scored: list[tuple[float, bool, str, str]] = []
-    reasons: list[str] = []
+    without: dict[str, str] = {}
     for gateway, status in gateways.items():
-        warm = _warm(need, containers.get(gateway, {}).values())
+        warm = warmth(need, containers.get(gateway, {}).values())
         if status.draining:
-            reasons.append(f"{gateway} is draining")
-            continue
-        if status.pool_problem and not warm:
-            reasons.append(f"{gateway}: {status.pool_problem}")
+            without[gateway] = "is draining"
+        elif reason := (excluded or {}).get(gateway, ""):
+            without[gateway] = reason
+        elif status.pool_problem and not warm:
+            without[gateway] = status.pool_problem
+        if gateway in without:
             continue
         near = holds.get(gateway, 0.0)
         if not holds and robot is not None:
             near = float(robot.gateway == gateway)
         silent_s = (stale_s or {}).get(gateway, 0.0)
-        trust = 0.5 ** (silent_s / STALE_HALF_S)
-        load = UNKNOWN_LOAD + (min(1.0, max(0.0, status.load)) - UNKNOWN_LOAD) * trust
-        score = config.load_weight * (1 - load) + config.data_weight * near + config.warm_weight * warm * trust
+        counts = trust(silent_s)
+        score = (
+            config.load_weight * (1 - settled_load(status.load, silent_s))
+            + config.data_weight * near
+            + config.warm_weight * warm * counts
+        )
         silent = f" (silent for {silent_s:.0f} s too long)" if silent_s >= 0.5 else ""
         scored.append((score, gateway == here, gateway, f"{gateway} {score:.2f}{silent}"))
-    scored.sort(key=lambda row: (row[2] in avoid, -row[0], not row[1], row[2]))
+    # One that gives runs away for want of room is given one only when nobody else is left.
+    scored.sort(key=lambda row: (row[2] in avoid, bool(gateways[row[2]].overloaded), -row[0], not row[1], row[2]))
+    reasons = [f"{name} {text}" if text == "is draining" else f"{name}: {text}" for name, text in without.items()]
     if not scored:
-        return Placement(order=(), why="; ".join(reasons) or "no gateway is present")
-    return Placement(order=tuple(row[2] for row in scored), why=", ".join([row[3] for row in scored] + reasons))
+        return Placement(order=(), why="; ".join(reasons) or "no gateway is present", excluded=without)
+    return Placement(
+        order=tuple(row[2] for row in scored),
+        why=", ".join([row[3] for row in scored] + reasons),
+        scores={row[2]: round(row[0], 3) for row in scored},
+        excluded=without,
+    )
+
+
+def trust(silent_s: float) -> float:
+    """How far facts of a gateway count that has been silent for so long beyond what it promised, 1 to 0."""
+    return 0.5 ** (silent_s / STALE_HALF_S)
+
+
+def settled_load(load: float, silent_s: float) -> float:
+    """Return a load as it may be by now: the longer the silence, the nearer to what is thought of the unknown."""
+    return UNKNOWN_LOAD + (min(1.0, max(0.0, load)) - UNKNOWN_LOAD) * trust(silent_s)
 
 
 def holds(
@@ -112,7 +141,8 @@ def holds(
     return {gateway: size / total for gateway, size in held.items()}
 
 
-def _warm(need: Need, containers: Iterable[ContainerInfo]) -> float:
+def warmth(need: Need, containers: Iterable[ContainerInfo]) -> float:
+    """Return how warm a gateway is for a need: 1 with a ready container of its image, 0.5 with a compatible one."""
     best = 0.0
     for container in containers:
         if container.state is ContainerState.READY:
@@ -152,6 +182,11 @@ def bind(
         robot = robots.get(bound)
         if robot is None or not robot.online:
             return None, f"waits for {bound}: {'offline' if robot else 'not in the roster'}"
+        for each in mine:
+            if not each.state.final:
+                asked = (uses.get(each.subtask.id, ()), verbs.get(each.subtask.id, ()))
+                if reason := lacks(robot, *asked):
+                    return None, f"waits for {bound}: {reason}"
         return bound, ""
     taken = {each.bound_robot for each in records if each.bound_robot}
     named = {each.subtask.robot for each in records if each.subtask.robot}

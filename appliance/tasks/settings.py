@@ -1,6 +1,8 @@
 """Configuration of the task manager."""
 
-from msgspec import Struct, field
+from typing import Annotated
+
+from msgspec import Meta, Struct, field
 
 from appliance.tasks.detection import DetectionConfig
 from appliance.tasks.migration.settings import MigrationConfig
@@ -16,6 +18,14 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Coarse score: weight of holding the inputs or the robot's link."""
     warm_weight: float = 0.3
     """Coarse score: weight of a ready container of the image."""
+    group_size: Annotated[int, Meta(ge=1, le=64)] = 8
+    """Gateways in a task's dynamic group at most: as many as can know of each other's containers without a search."""
+    regroup_s: Annotated[float, Meta(gt=0)] = 5.0
+    """How often a group is looked at as a whole while all its members can serve: often enough to follow the fleet, and
+    seldom enough for what it costs (a look at all gateways)."""
+    backlog: Annotated[float, Meta(ge=0)] = 1.0
+    """Runs that a coordinator lets be at a gateway beyond its containers, as a part of these: enough that none stands
+    idle until its coordinator hears of it (70 ms), few enough that turns are taken here and not in its queue."""
     max_tasks: int = 200
     """Unfinished tasks one gateway coordinates; further submissions are refused with the reason."""
     max_instruction_chars: int = 2000

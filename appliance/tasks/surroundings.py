@@ -7,11 +7,12 @@ from typing import Any, Protocol
 from msgspec import Struct
 
 from appliance.errors import RefusedError
-from appliance.model import Need, Plan, RunAccepted, RunEvent, RunRequest, SubtaskRecord, TaskRecord
+from appliance.model import Group, Need, Plan, RunAccepted, RunEvent, RunRequest, SubtaskRecord, TaskRecord
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.bounds import MAX_RUN_S
 from appliance.tasks.checkpoints import Checkpoint
+from appliance.tasks.line import Place
 from appliance.tasks.placement import Placement
 from appliance.tasks.replan.robots import Robots
 from appliance.tasks.settings import TasksConfig
@@ -72,6 +73,18 @@ class Surroundings(Protocol):
 
     def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
         """Order the gateways for a subtask."""
+        ...
+
+    def regroup(self, record: TaskRecord) -> Group | None:
+        """Return the group that a task should have from now on, or None when the present one may stay."""
+        ...
+
+    def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
+        """Return where a ready subtask may go now, or its place among those that wait for room."""
+        ...
+
+    def expect(self, plan: Plan, *, deadline_s: float, elapsed_s: float) -> str:
+        """Say in words what a plan must expect: a wait, a deadline that can hardly be met; "" when nothing."""
         ...
 
     async def order(self, gateway: str, request: RunRequest) -> RunAccepted:

@@ -17,6 +17,7 @@ import pytest
 from appliance.errors import ConflictError, NotFoundError, PlanError, SwiftbotError, UnreachableError
 from appliance.model import (
     Choice,
+    Group,
     Need,
     Phase,
     Plan,
@@ -41,6 +42,7 @@ from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine
 from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.driver import Driver
+from appliance.tasks.line import Place
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement
 from appliance.tasks.replan.robots import Robots
@@ -453,6 +455,10 @@ class FakeSurroundings:
         self.orders: asyncio.Queue[tuple[str, RunRequest]] = asyncio.Queue()
         self.refusals: list[Exception] = []
         self.passed_to = ""
+        self.groups: list[Group] = []
+        self.room = True
+        self.left_s: list[float] = []
+        self.expected = ""
         self.moved: list[tuple[tuple[str, ...], dict[str, float]]] = []
         self.durations: list[tuple[str, float]] = []
         self.checkpoints: dict[str, Checkpoint] = {}
@@ -482,6 +488,19 @@ class FakeSurroundings:
         """Gateways in order, those where it failed last."""
         failed = {each.gateway for each in target.attempts if each.failure}
         return Placement(order=tuple(sorted(self.places, key=lambda each: each in failed)), why="none is there")
+
+    def regroup(self, record: TaskRecord) -> Group | None:
+        """Return the group that the test says."""
+        return self.groups.pop(0) if self.groups else None
+
+    def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
+        """Send it to the first, while the test says that there is room."""
+        self.left_s.append(left_s)
+        return Place(gateway=placement.order[0]) if self.room else Place(position=1, waiting=1)
+
+    def expect(self, plan: Plan, *, deadline_s: float, elapsed_s: float) -> str:
+        """Return what the test says."""
+        return self.expected
 
     def plan_moved(self, record: TaskRecord, running_s: Mapping[str, float]) -> None:
         """Remember the states told."""
@@ -561,6 +580,10 @@ class Bench:
         assert self.driver is not None
         await asyncio.wait_for(self.task, 5)
         return self.driver.record
+
+    def transitions(self, task: str = "t-1") -> list[Transition]:
+        """The transitions that were published."""
+        return self.plane.session.sent(self.plane.keys.transition(task), Transition)
 
     def stored(self, task: str = "t-1") -> TaskRecord:
         """The record as written."""

@@ -1,0 +1,121 @@
+"""Whether a task is taken: what is wrong with a request, when to come back, and what one that is taken must expect."""
+
+import math
+import uuid
+from collections import deque
+from collections.abc import Mapping
+
+from msgspec.structs import replace
+
+from appliance.errors import PayloadError, RefusedError
+from appliance.model import HIGHEST_PRIORITY, LONGEST_DEADLINE_S, PLAIN_PRIORITY, Plan, TaskRequest
+from appliance.plane.keys import check_name
+from appliance.tasks.bounds import MAX_DEPTH, too_deep
+from appliance.tasks.settings import TasksConfig
+
+MAX_SUBMITTER = 120
+ENDS = 32
+"""Ends of tasks from which the rate is measured: enough for a mean, few enough to follow a change."""
+LONGEST_RETRY_S = 600.0
+"""Nobody is sent away for longer: so far ahead the rate says nothing."""
+
+
+def checked(request: TaskRequest, config: TasksConfig) -> TaskRequest:
+    """Return a request with its text trimmed and an id; PayloadError says what is wrong with one that cannot be."""
+    instruction = request.instruction.strip()
+    if not instruction:
+        raise PayloadError("the instruction is empty", remedy="say what is to be done")
+    if len(instruction) > config.max_instruction_chars:
+        raise PayloadError(
+            f"the instruction has {len(instruction):,} characters, more than {config.max_instruction_chars:,}",
+            remedy="split it, or raise tasks.max_instruction_chars",
+        )
+    if len(request.submitter) > MAX_SUBMITTER:
+        raise PayloadError(f"the submitter's name has more than {MAX_SUBMITTER} characters")
+    if request.plan is not None and any(too_deep(each.params) for each in request.plan.subtasks):
+        raise PayloadError(f"parameters are nested more than {MAX_DEPTH} deep", remedy="write them flat")
+    if not 0 <= request.priority <= HIGHEST_PRIORITY:
+        raise PayloadError(
+            f"priority {request.priority} is none", remedy=f"0 to {HIGHEST_PRIORITY}, {PLAIN_PRIORITY} is plain"
+        )
+    if not 0 <= request.deadline_s <= LONGEST_DEADLINE_S:  # false for what is not a number
+        raise PayloadError(
+            f"a deadline of {request.deadline_s:g} s is none",
+            remedy=f"seconds from now, up to {LONGEST_DEADLINE_S:g}; 0 for none",
+        )
+    for name in request.group:
+        check_name(name, "gateway")
+    task = request.id or f"t-{uuid.uuid4().hex[:10]}"
+    return replace(request, instruction=instruction, id=check_name(task, "task"))
+
+
+class Ends:
+    """When tasks ended here, from which is measured how fast they do. The clock is passed in."""
+
+    def __init__(self) -> None:
+        self._at: deque[float] = deque(maxlen=ENDS)
+
+    def ended(self, now: float) -> None:
+        """Note that a task has ended."""
+        self._at.append(now)
+
+    def rate(self, now: float) -> float:
+        """Tasks a second of late; 0 when fewer than two have ended. It falls while none ends."""
+        if len(self._at) < 2:
+            return 0.0
+        return len(self._at) / max(1e-3, now - self._at[0])
+
+    def retry_after_s(self, ends: int, now: float) -> float:
+        """Seconds until so many more tasks will have ended; 0: not known."""
+        rate = self.rate(now)
+        return min(LONGEST_RETRY_S, round(ends / rate, 1)) if rate else 0.0
+
+
+def full(gateway: str, unfinished: int, retry_after_s: float) -> RefusedError:
+    """Return the refusal of a coordinator that has as many tasks as it may have."""
+    when = f"ask again in about {retry_after_s:g} s" if retry_after_s else "wait for some to end"
+    return RefusedError(
+        f"{gateway} already coordinates {unfinished} unfinished tasks",
+        remedy=f"{when}, or cancel some",
+        retry_after_s=retry_after_s,
+    )
+
+
+def longest_s(plan: Plan, seconds: Mapping[str, float]) -> float:
+    """Return how long a plan takes when nothing waits: its longest chain of subtasks (`seconds` by id)."""
+    ends: dict[str, float] = {}
+    left = list(plan.subtasks)
+    ids = {each.id for each in left}
+    while left:
+        later = [each for each in left if any(before in ids and before not in ends for before in each.after)]
+        for each in left:
+            if each not in later:
+                start = max((ends[before] for before in each.after if before in ends), default=0.0)
+                ends[each.id] = start + seconds.get(each.id, 0.0)
+        if len(later) == len(left):
+            break  # a circle, which no valid plan has
+        left = later
+    return max(ends.values(), default=0.0)
+
+
+def expectation(
+    *, waiting: int, wait_s: float | None, work_s: float | None, deadline_s: float, elapsed_s: float = 0.0
+) -> str:
+    """Return what a task must expect, in words; empty when it can start at once and has time enough.
+
+    Args:
+        waiting: subtasks that wait for room before it.
+        wait_s: how long they are expected to; None: not known.
+        work_s: how long its plan takes when nothing waits; None: there is no plan yet.
+        deadline_s: from acceptance; 0: none.
+        elapsed_s: since acceptance.
+    """
+    told: list[str] = []
+    if waiting:
+        when = "" if wait_s is None else f", it is expected to start in about {max(0.1, wait_s):.1f} s"
+        told.append(f"{waiting} subtasks wait for room before it{when}")
+    needed_s = (wait_s or 0.0 if waiting else 0.0) + (work_s or 0.0)
+    left_s = deadline_s - elapsed_s if deadline_s else math.inf
+    if needed_s > left_s:
+        told.append(f"its deadline can hardly be met: about {needed_s:.1f} s are needed, {max(0.0, left_s):.1f} s left")
+    return "; ".join(told)
