@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -62,9 +62,10 @@ async def run(count: int, cold: int, *, progress: Callable[[str], None]) -> dict
         return {"missing": "Ray is not installed", "remedy": REMEDY}
     progress(f"Ray: {count} warm calls, {cold} new actors")
     with tempfile.TemporaryDirectory(prefix="swiftbot-ray-") as folder:
-        async with _side(python, count, cold, folder) as process:
+        arguments = (str(count), str(cold), str(ACTORS), str(PAUSE_S), folder)
+        async with side(python, _SIDE, arguments, folder) as process:
             wait_s = WAIT_S + 2 * PAUSE_S * count + 5 * cold
-            found = {event: await _line(process, event, wait_s) for event in ("ready", "warm", "cold")}
+            found = {event: await line(process, event, wait_s) for event in ("ready", "warm", "cold")}
     times = {
         "start": found["warm"]["start_ms"],
         "round_trip": found["warm"]["round_trip_ms"],
@@ -79,13 +80,15 @@ async def run(count: int, cold: int, *, progress: Callable[[str], None]) -> dict
 
 
 @asynccontextmanager
-async def _side(python: Path, count: int, cold: int, folder: str) -> AsyncGenerator[asyncio.subprocess.Process]:
+async def side(
+    python: Path, script: Path, arguments: Sequence[str], folder: str
+) -> AsyncGenerator[asyncio.subprocess.Process]:
     """Ray's side as a process group of its own, ended with all it started whatever happens here."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
     environment |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     # -P: this folder is no place to import from.
     process = await asyncio.create_subprocess_exec(
-        str(python), "-P", str(_SIDE), str(count), str(cold), str(ACTORS), str(PAUSE_S), folder,
+        str(python), "-P", str(script), *arguments,
         stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
         limit=2**24, env=environment, cwd=folder, start_new_session=True,
     )  # fmt: skip
@@ -104,22 +107,22 @@ async def _side(python: Path, count: int, cold: int, folder: str) -> AsyncGenera
                     break
 
 
-async def _line(process: asyncio.subprocess.Process, event: str, wait_s: float) -> dict[str, Any]:
+async def line(process: asyncio.subprocess.Process, event: str, wait_s: float) -> dict[str, Any]:
     """Return the next line, which must be of that event."""
     if process.stdout is None or process.stderr is None:
         raise PoolError("Ray's side has no pipes")
     try:
         async with asyncio.timeout(wait_s):
             while True:
-                line = await process.stdout.readline()
-                if not line:
+                found = await process.stdout.readline()
+                if not found:
                     problem = (await process.stderr.read(2**16)).decode(errors="replace").strip()
                     raise PoolError(f"Ray's side ended: {problem[-400:] or 'without a word'}", remedy=REMEDY)
-                if line.startswith(b"{"):  # Ray itself prints as well
+                if found.startswith(b"{"):  # Ray itself prints as well
                     break
     except TimeoutError:
         raise PoolError(f"Ray's side told no {event} within {wait_s:g} s") from None
-    told = json.loads(line)
+    told = json.loads(found)
     if told.get("event") != event:
         raise PoolError(f"Ray's side told {str(told)[:80]}, not {event}")
     return told

@@ -293,6 +293,39 @@ def history(
     return 0 if result["held"] else 1
 
 
+@bench_app.command
+def throughput(
+    *,
+    parallel: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (1, 4, 8, 16, 32),
+    seconds: float = 8.0,
+    gateways: int = 4,
+    containers: int = 3,
+    kills: int = 5,
+    ray: bool = True,
+    profile: bool = True,
+    as_json: Json = False,
+) -> int:
+    """Trivial subtasks a second through a fleet, where the time goes, and recovery from a killed worker; beside Ray.
+
+    Args:
+        parallel: Subtasks wanted at any time: up to 4, or a multiple of 4; one measurement each.
+        seconds: For how long each.
+        gateways: Gateways, each a process.
+        containers: Containers each keeps ready.
+        kills: Workers killed, one after the other.
+        ray: Measure Ray beside it, if `make ray` has installed it.
+        profile: Sample where the gateways' time goes; costs about 1 %.
+    """
+    from appliance.bench.throughput.run import Options, parallels, run
+
+    options = Options(
+        parallel=parallels(parallel), seconds=seconds, gateways=gateways, containers=containers, kills=kills, ray=ray,
+        profile=profile,
+    )  # fmt: skip
+    tell(measure(run(options, progress=say)), as_json=as_json)
+    return 0
+
+
 @bench_app.command(name="table")
 def bench_table(file: Path, /) -> int:
     """Render what a benchmark printed with --json as Markdown tables.

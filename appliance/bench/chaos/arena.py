@@ -44,6 +44,7 @@ class Arena:
         skills: folder of the run's own skills.
         base: further settings of every gateway.
         command: what runs a gateway, with the path of its configuration behind.
+        recorder: whether a recorder runs beside them.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class Arena:
         skills: Path | None = None,
         base: GatewayConfig | None = None,
         command: Sequence[str] = (sys.executable, "-m", "appliance.cli", "gateway", "--config"),
+        recorder: bool = True,
     ) -> None:
         self.fleet = fleet
         self.directory = directory
@@ -66,6 +68,7 @@ class Arena:
         self._pool = pool
         self._skills = skills
         self._gateway_command = tuple(command)
+        self._records = recorder
         self._base = base or GatewayConfig(id="gw-1", llm=LlmConfig(tiers=("rules",)))
 
     @property
@@ -137,7 +140,8 @@ class Arena:
         self.prepare()
         for name in self.names:
             self.start(name)
-        self.record()
+        if self._records:
+            self.record()
         progress(f"{len(self.names)} gateways of fleet {self.fleet} start")
         async with await self.client() as client:
             await self.settled(client, ready=ready)
