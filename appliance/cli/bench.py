@@ -163,6 +163,36 @@ def transfer(*, megabytes: int = 64, rounds: int = 3, as_json: Json = False) -> 
 
 
 @bench_app.command
+def migrate(
+    *,
+    moves: int = 30,
+    volume_moves: int = 6,
+    megabytes: int = 64,
+    cold: int = 5,
+    runs: int = 16,
+    work_s: float = 3.0,
+    overload: Annotated[bool, Parameter(negative="--no-overload")] = True,
+    as_json: Json = False,
+) -> int:
+    """How long moving a run to another gateway takes, beside starting it anew cold; and overload with and without.
+
+    Args:
+        moves: Moves with a checkpoint of 1 kB, and of 256 kB.
+        volume_moves: Moves with a state volume.
+        megabytes: Size of that volume.
+        cold: Runs that are ended and started anew.
+        runs: Runs that come to one gateway of four.
+        work_s: What each of them works, seconds.
+        overload: Measure the overload too.
+    """
+    from appliance.bench.migrate import run
+
+    work = run(moves, volume_moves, megabytes, cold, runs, work_s, overload=overload, progress=say)
+    tell(measure(work), as_json=as_json)
+    return 0
+
+
+@bench_app.command
 def soak(*, count: int = 10_000, at_once: int = 3, image: str = "base", seed: int = 1, as_json: Json = False) -> int:
     """Thousands of subtasks through one gateway, some of which misbehave: counts before and after, leaks, memory.
 

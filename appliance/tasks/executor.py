@@ -41,6 +41,7 @@ from appliance.tasks.elsewhere import Elsewhere
 from appliance.tasks.passing import ORDER_S, PassedOn, Passing, explained, passed_on
 from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.surroundings import task_key
 from appliance.tasks.telling import Telling
 
 log = structlog.get_logger(__name__)
@@ -375,10 +376,30 @@ class Executor:
             event = self._last[run_id]
             outdated = event.attempt < attempts.get(event.subtask, 0)
             if run_id in self._running:
-                if outdated or record.state.final:
+                if record.state.final:
                     self._later(self._end(run_id))
+                elif outdated:
+                    self._later(self._end_outdated(event))
             elif record.state.final:
                 self._forget(run_id)
+
+    async def _end_outdated(self, event: RunEvent) -> None:
+        """End a run whose attempt a coordinator has left behind, if the record itself says so too.
+
+        After a partition the coordinator whose version loses goes on telling for a moment: a run of the version that
+        stands must not be ended by it.
+        """
+        try:
+            stored = await self._plane.dht.read(task_key(event.task))
+            record = read_record(stored.value) if stored is not None else None
+        except SwiftbotError:
+            record = None  # nothing speaks against what was heard
+        if record is not None and record.id == event.task:
+            current = next((each.attempt for each in record.subtasks if each.subtask.id == event.subtask), 0)
+            if not record.state.final and current <= event.attempt:
+                log.info("a coordinator that was succeeded is not heeded", run=f"{event.task}/{event.subtask}")
+                return
+        await self._end(f"{event.task}/{event.subtask}/{event.attempt}")
 
     def _later(self, work: Coroutine[Any, Any, object]) -> None:
         task = asyncio.ensure_future(work)

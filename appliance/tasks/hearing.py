@@ -108,6 +108,12 @@ class Hearing:
                     self._around.took(target.subtask.skill, event.duration_ms)
             case RunEventKind.FAILED:
                 failure = event.failure or Failure(code="internal", message="the run failed without a reason")
+                if failure.code == "cancelled" and keeper.record.state is TaskState.RUNNING:
+                    # By its gateway, which drains or heard an outdated record: nothing is wrong with the subtask.
+                    failure = msgspec.structs.replace(
+                        failure, code="orphaned", message=f"ended there, though its task goes on: {failure.message}",
+                        retryable=True,
+                    )  # fmt: skip
                 self.attempt_failed(target, failure, event.duration_ms, event=event)
             case RunEventKind.PARTIAL:
                 self._partials.add(event)

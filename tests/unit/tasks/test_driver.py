@@ -379,3 +379,16 @@ async def test_a_task_that_is_given_up_ends_with_the_reason(bench: Any) -> None:
     ended = await bench.end()
     assert ended.state is TaskState.FAILED
     assert ended.failure.message == why.message
+
+
+async def test_a_run_that_its_gateway_ended_by_itself_is_repeated(bench: Any) -> None:
+    """Nobody has cancelled the task: the attempt is repeated, at no cost to the skill's retries."""
+    await bench.start()
+    for _ in range(3):
+        _, request = await bench.ordered()
+        bench.tell(request, FAILED, failure=Failure(code="cancelled", message="the gateway drains"))
+    _, request = await bench.ordered()
+    bench.tell(request, SUCCEEDED, result={"ok": 1})
+    ended = await bench.end()
+    assert ended.state is TaskState.SUCCEEDED
+    assert [each.failure.code for each in ended.subtasks[0].attempts[:3]] == ["orphaned"] * 3

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
 from appliance.model import (
+    Attempt,
     Choice,
     Considered,
     Need,
@@ -17,6 +18,9 @@ from appliance.model import (
     RunEvent,
     RunEventKind,
     RunRequest,
+    Subtask,
+    SubtaskRecord,
+    TaskRecord,
     TaskState,
     Way,
     encode,
@@ -26,10 +30,12 @@ from appliance.tasks.api import RunAsk
 from appliance.tasks.checkpoints import read_checkpoint
 from appliance.tasks.executor import Executor
 from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
+from appliance.tasks.surroundings import task_key
 
 pytestmark = pytest.mark.anyio
 
 REQUEST = RunRequest(task="t-1", subtask="s1", attempt=1, skill="work", need=Need(image="base"))
+ATTEMPT = Attempt(number=1, gateway="gw-1")
 ASK = RunAsk(task="t-1", subtask="s1", attempt=1)
 AWAY = Decision(phase=Phase.REMOTE_WARM, gateway="gw-2", container="c2")
 
@@ -317,3 +323,25 @@ async def test_a_runs_checkpoints_are_kept_and_told_without_their_data(
     kept = await read_checkpoint(plane.dht, "t-1", "s1")
     assert kept is not None
     assert kept.data == {"at": 7}
+
+
+async def test_a_run_is_not_ended_by_the_word_of_a_coordinator_that_was_succeeded(
+    executor: Executor, plane: Any, pool: Any
+) -> None:
+    """After a partition the side that lost still tells of its later attempt: what the record itself says counts."""
+    await executor.run(REQUEST)
+    one, two = (
+        msgspec.json.decode(encode(plane.accepted()), type=TaskRecord) for _ in range(2)
+    )  # two versions of one task
+    one = replace(one, subtasks=(SubtaskRecord(subtask=Subtask(id="s1", skill="work"), attempts=(ATTEMPT,)),))
+    two = replace(two, subtasks=(replace(one.subtasks[0], attempts=(replace(ATTEMPT, number=2),)),))
+    version = await plane.dht.write(task_key("t-1"), encode(one), expected=None)
+    plane.session.put(plane.keys.task("t-1"), encode(two))
+    await asyncio.sleep(0.05)
+    assert not pool.cancelled
+    await plane.dht.write(task_key("t-1"), encode(two), expected=version)
+    plane.session.put(plane.keys.task("t-1"), encode(two))
+    async with asyncio.timeout(5):
+        while pool.cancelled != ["t-1/s1/1"]:
+            await asyncio.sleep(0.005)
+    await finish(pool)
