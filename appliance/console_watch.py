@@ -27,7 +27,7 @@ _FIGURES = (("startup_ms", "startup"), ("duration_ms", "took"), ("cpu_ms", "cpu"
 def stream_line(line: Line) -> Text:
     """One line of a stream: time, gateway, subtask/attempt, what it is, what it says."""
     at = time.strftime("%H:%M:%S", time.localtime(line.at_ns / 1e9)) + f".{line.at_ns // 1_000_000 % 1000:03d}"
-    which = f"{line.subtask}/{line.attempt}" if line.subtask else "–"
+    which = f"{line.subtask}/{line.attempt}" if line.attempt else line.subtask or "–"
     style = _LEVELS.get(line.level, _STYLES[line.kind])
     text = line.text
     if line.kind is LineKind.PROGRESS:

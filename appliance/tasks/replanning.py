@@ -158,7 +158,7 @@ class Replanning:
     ) -> None:
         keeper = self._keeper
         revised = keeper.transition(
-            kind, subtask=target.subtask.id, plan=plan, robot=robot, note=clean(note, MAX_NOTE)
+            kind, subtask=target.subtask.id, attempt=target.attempt, plan=plan, robot=robot, note=clean(note, MAX_NOTE)
         )  # fmt: skip
         if not keeper.take(revised):
             # A defect of the decider, met in whatever it did not foresee: the task ends as it would have without it.
@@ -173,7 +173,7 @@ class Replanning:
     def _give_up(self, target: SubtaskRecord, why: str) -> None:
         keeper = self._keeper
         given_up = keeper.transition(
-            TransitionKind.REPLAN_FAILED, subtask=target.subtask.id, note=clean(why, MAX_NOTE)
+            TransitionKind.REPLAN_FAILED, subtask=target.subtask.id, attempt=target.attempt, note=clean(why, MAX_NOTE)
         )  # fmt: skip
         if keeper.take(given_up):
             self._around.recovery.note(str(TransitionKind.REPLAN_FAILED), keeper.record, target, why)
