@@ -374,7 +374,9 @@ class Executor:
                 self._withdrawn.add(run_id)
         for run_id in mine:
             event = self._last[run_id]
-            outdated = event.attempt < attempts.get(event.subtask, 0)
+            # A revised plan may have no such subtask any more.
+            gone = bool(attempts) and event.subtask not in attempts
+            outdated = gone or event.attempt < attempts.get(event.subtask, 0)
             if run_id in self._running:
                 if record.state.final:
                     self._later(self._end(run_id))
@@ -395,8 +397,9 @@ class Executor:
         except SwiftbotError:
             record = None  # nothing speaks against what was heard
         if record is not None and record.id == event.task:
-            current = next((each.attempt for each in record.subtasks if each.subtask.id == event.subtask), 0)
-            if not record.state.final and current <= event.attempt:
+            current = next((each.attempt for each in record.subtasks if each.subtask.id == event.subtask), None)
+            gone = current is None and event.subtask in record.retired
+            if not record.state.final and not gone and (current or 0) <= event.attempt:
                 log.info("a coordinator that was succeeded is not heeded", run=f"{event.task}/{event.subtask}")
                 return
         await self._end(f"{event.task}/{event.subtask}/{event.attempt}")

@@ -345,3 +345,18 @@ async def test_a_run_is_not_ended_by_the_word_of_a_coordinator_that_was_succeede
         while pool.cancelled != ["t-1/s1/1"]:
             await asyncio.sleep(0.005)
     await finish(pool)
+
+
+async def test_a_run_of_a_subtask_that_a_revised_plan_left_out_is_ended(
+    executor: Executor, plane: Any, pool: Any
+) -> None:
+    """Its gateway may have been away when it was to be ended: the record, from which it is gone, ends it."""
+    await executor.run(REQUEST)
+    other = SubtaskRecord(subtask=Subtask(id="r1_1", skill="work"))
+    revised = replace(plane.accepted(), subtasks=(other,), retired=("s1",))
+    await plane.dht.write(task_key("t-1"), encode(revised), expected=None)
+    plane.session.put(plane.keys.task("t-1"), encode(revised))
+    async with asyncio.timeout(5):
+        while pool.cancelled != ["t-1/s1/1"]:
+            await asyncio.sleep(0.005)
+    await finish(pool)
