@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import sys
 import textwrap
 import time
 from collections.abc import AsyncIterator
@@ -11,11 +12,13 @@ from typing import Any
 
 import msgspec
 
+from appliance import config as configuration
 from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.local_fleet import FleetState, Order
 from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest
+from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.settings import TasksConfig
@@ -128,6 +131,33 @@ async def fleet_of(
         yield state
     finally:
         await local_fleet.down(order.directory, progress=print)
+
+
+@asynccontextmanager
+async def further_gateway(state: FleetState, name: str, pool: PoolConfig) -> AsyncIterator[None]:
+    """One gateway more, with another pool; it is not waited for."""
+    folder = Path(state.directory)
+    like = configuration.load(folder / state.gateways[0] / "gateway.toml")
+    config = msgspec.structs.replace(
+        like,
+        id=name,
+        data_dir=str(folder / name / "data"),
+        plane=PlaneConfig(listen=(f"tcp/127.0.0.1:{local_fleet.free_port()}",), connect=state.endpoints),
+        pool=pool,
+    )
+    path = folder / name / "gateway.toml"
+    path.parent.mkdir(parents=True)
+    path.write_text(configuration.dump(config))
+    with (folder / "logs" / f"{name}.log").open("ab") as log:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "appliance.cli", "gateway", "--config", str(path), stdout=log, stderr=log
+        )
+    try:
+        yield
+    finally:
+        process.terminate()
+        async with asyncio.timeout(60):
+            await process.wait()
 
 
 def counting(

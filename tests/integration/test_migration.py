@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from moving_bench import counting, ended, fleet_of, pretty, until_running
+from moving_bench import counting, ended, fleet_of, further_gateway, pretty, until_running
 
 from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, RefusedError
 from appliance.model import TaskState
-from appliance.pool.settings import PoolConfig
+from appliance.pool.settings import PoolConfig, PressureConfig
 from appliance.record.reader import read
 from appliance.tasks.migration.api import MigrateAsk, MigrationRequest
 from appliance.tasks.migration.settings import MigrationConfig
@@ -144,28 +144,31 @@ async def test_a_target_that_dies_costs_no_retry_and_no_step(tmp_path: Path) -> 
         assert result["by"] == sorted(set(result["by"])), result
 
 
-async def test_an_overloaded_gateway_gives_waiting_runs_away(tmp_path: Path) -> None:
-    """More runs than its containers: those that wait go elsewhere, each at most once, and all end without a retry."""
-    pools = {"gw-1": PoolConfig(floor={"base": 1}, capacity=1)}
-    config = MigrationConfig(above_s=0.5, settle_s=5.0)
+async def test_a_gateway_short_of_memory_gives_running_work_away(tmp_path: Path) -> None:
+    """Its pool is squeezed: its runs go on elsewhere from their checkpoints, each once, and none comes back to it."""
+    squeezed = PoolConfig(floor={"base": 2}, pressure=PressureConfig(spare_mb=10_000_000))
+    config = MigrationConfig(above_s=0.5, settle_s=2.0)
     async with (
-        fleet_of(tmp_path, pools=pools, migration=config) as state,
+        fleet_of(tmp_path, gateways=2, migration=config) as state,
         FleetClient(state.endpoint) as client,
+        further_gateway(state, "gw-short", squeezed),
     ):
-        for gateway in ("gw-2", "gw-3"):
+        for gateway in ("gw-1", "gw-2"):
             await client.drain(gateway, 0.0)
-        await client.submit(counting("t-over", steps=150, step_s=0.1, count=4))
-        await until_running(client, "t-over", None)
-        async with asyncio.timeout(60):
-            while not client.plane.registry.gateways["gw-1"].overloaded:
-                await asyncio.sleep(0.05)
-        for gateway in ("gw-2", "gw-3"):
+        async with asyncio.timeout(90):
+            while (status := client.plane.registry.gateways.get("gw-short")) is None or status.ready < 2:
+                await asyncio.sleep(0.1)
+        assert status.overloaded.startswith("memory is short"), pretty(status)
+        await client.submit(counting("t-over", steps=400, count=2))
+        for subtask in ("s1", "s2"):
+            assert (await until_running(client, "t-over", subtask)).gateway == "gw-short"
+        for gateway in ("gw-1", "gw-2"):
             await client.undrain(gateway)
         last = await ended(client, "t-over")
         assert last.state is TaskState.SUCCEEDED, last.failure
-        moved = [each for each in last.subtasks if any(attempt.left for attempt in each.attempts)]
-        assert len(moved) == 3, pretty(last)
         for each in last.subtasks:
-            assert not any(attempt.failure for attempt in each.attempts), pretty(each)
-            assert each.attempt <= 2, pretty(each)
-        assert {each.gateway for each in moved} <= {"gw-2", "gw-3"}
+            assert each.attempts[0].gateway == "gw-short"
+            assert each.attempts[0].left.startswith("moved from gw-short"), pretty(each)
+            assert "overload" in each.attempts[0].left, pretty(each)
+            assert (each.attempt, bool(each.failure)) == (2, False), pretty(each)
+            assert (each.result or {})["by"] == [1, 2], pretty(each)
