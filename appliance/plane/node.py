@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import random
 import time
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from pathlib import Path
 import structlog
 from msgspec import Struct
 
-from appliance.errors import ConfigError, UnreachableError
+from appliance.errors import ConfigError, SwiftbotError, UnreachableError
 from appliance.plane.bounded import BoundedMembership
 from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
@@ -30,6 +31,9 @@ log = structlog.get_logger(__name__)
 STORE_FILE = "gateway.sqlite"
 
 
+AWAY_S = 60.0
+"""A gateway that was away for longer may have missed much, and fetches it before the others hand it requests; one that
+was restarted has nearly all, and is back sooner without."""
 MOST_ASKED = 3
 ASK_TIMEOUT_S = 0.5
 """One that is busy for longer is no help: what is linked directly counts then."""
@@ -83,8 +87,11 @@ class Plane:
         self.on_member_joined: list[Callable[[str], None]] = self._membership.on_joined
         self.on_member_lost: list[Callable[[str], None]] = self._membership.on_lost
         self.milestones: dict[str, float] = {}
-        """When on this machine's monotonic clock, seconds: `session` was open, `store`; `joined`: the others can see
-        it; `reconciled`: it answers for its keys with its shard compared."""
+        """When, on this machine's monotonic clock, `session` and `store` were open; `linked` to somebody; `present`: it
+        knew who is there; `fetched` what it will own; `joined`: the others can see it; `reconciled`: it answers for its
+        keys with its shard compared."""
+        self._away_s = 0.0
+        """For how long nothing was written here before."""
         self.dht.on_ring_change.append(lambda: self._reached("reconciled"))
 
     def _reached(self, milestone: str) -> None:
@@ -96,7 +103,8 @@ class Plane:
             after_ms = {
                 f"{name}_ms": round((at - opened) * 1e3, 2) for name, at in self.milestones.items() if at > opened
             }
-            log.info("back in the ring", gateway=self.gateway, session_opened_s=round(opened, 6), **after_ms)
+            opened_s, members = round(opened, 6), len(self._membership.members)
+            log.info("back in the ring", gateway=self.gateway, members=members, session_opened_s=opened_s, **after_ms)
 
     @classmethod
     async def open(cls, config: PlaneConfig, *, fleet: str, gateway: str, data_dir: Path) -> "Plane":
@@ -107,13 +115,12 @@ class Plane:
             PrerequisiteError: the disk is full or fails.
         """
         check_name(gateway, "gateway")
-        session = await Session.open(config, fleet)
-        opened = time.monotonic()
-        store: Store | None = None
+        away_s = _unwritten_s(data_dir / STORE_FILE)
+        session, opened, store = await _open_both(config, fleet, data_dir / STORE_FILE)
         plane: Plane | None = None
         try:
-            store = await Store.open(data_dir / STORE_FILE)
             plane = cls(config, session=session, store=store, gateway=gateway)
+            plane._away_s = away_s
             plane.milestones["session"] = opened
             plane._reached("store")
             await plane._join()
@@ -121,8 +128,7 @@ class Plane:
             if plane is not None:
                 await plane.close()
             else:
-                if store is not None:
-                    await store.close()
+                await store.close()
                 await session.close()
             raise
         return plane
@@ -132,18 +138,26 @@ class Plane:
         await self._voting.start(lost=self.store.set_aside is not None)
         if self.config.connect:
             await self._first_link()
-        if await self._taken():
-            raise ConfigError(
-                f"a gateway named {self.gateway} is already in fleet {self.keys.fleet}",
-                remedy="give each gateway an id of its own",
-            )
-        for name in await self._present():
-            membership.add(name)
-        membership.start()
-        self._pulse.start()
-        self.registry.start()
-        await membership.enter()
-        await self._reconciler.join()
+        self._reached("linked")
+        present = await self._present()
+        self._reached("present")
+        # With a full view nobody is told of this gateway before its token shows: it may look for its records meanwhile.
+        checking = asyncio.create_task(self._check_free(present), name="is the name free")
+        try:
+            if self.config.view != "full":
+                await checking
+            for name in present:
+                membership.add(name)
+            membership.start()
+            self._pulse.start()
+            self.registry.start()
+            await membership.enter()
+            if self._away_s > AWAY_S:
+                await self._reconciler.join()
+            self._reached("fetched")
+            await checking
+        finally:
+            checking.cancel()
         membership.join()
         self._reached("joined")
         self._reconciler.start()
@@ -154,20 +168,23 @@ class Plane:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.config.join_wait_s):
                 while not self.session.linked:  # noqa: ASYNC110 - the library has no event for it
-                    await asyncio.sleep(0.005)
+                    await asyncio.sleep(0.001)
 
-    async def _taken(self) -> bool:
-        """Whether another process shows our token; one that was killed may do so for a lease."""
+    async def _check_free(self, present: list[str]) -> None:
+        """Raise ConfigError when another process shows our token; one that was killed may do so for a lease."""
         until = asyncio.get_running_loop().time() + 2 * self.config.lease_ms / 1e3
-        while await self.session.alive_now(self.keys.alive(self.gateway)) or await self._known_to_others():
+        while self.gateway in present or await self._known_to(present):
             if asyncio.get_running_loop().time() > until:
-                return True
+                raise ConfigError(
+                    f"a gateway named {self.gateway} is already in fleet {self.keys.fleet}",
+                    remedy="give each gateway an id of its own",
+                )
             await asyncio.sleep(0.02)
-        return False
+            present = await self._present()
 
-    async def _known_to_others(self) -> bool:
+    async def _known_to(self, present: list[str]) -> bool:
         """Whether gateways that are linked already see one of our name to which we have no link yet."""
-        others = [name for name in await self._present() if name != self.gateway][:MOST_ASKED]
+        others = [name for name in present if name != self.gateway][:MOST_ASKED]
         ask = MemberAsk(gateway=self.gateway)
         answers = await asyncio.gather(
             *(self.rpc.call(name, "member", ask, Member, timeout_s=ASK_TIMEOUT_S) for name in others),
@@ -205,6 +222,29 @@ class Plane:
         await self.session.close()
         await self.store.close()
         self._pulse.close()
+
+
+def _unwritten_s(path: Path) -> float:
+    """For how long a store has not been written to, by this machine's clock; endless where there is none."""
+    written = [each.stat().st_mtime for each in (path, path.with_name(f"{path.name}-wal")) if each.exists()]
+    return max(0.0, time.time() - max(written)) if written else math.inf
+
+
+async def _open_both(config: PlaneConfig, fleet: str, path: Path) -> tuple[Session, float, Store]:
+    """Open session and store at the same time; returns when the session was open too. Errors as `Plane.open`."""
+    storing = asyncio.create_task(Store.open(path), name="open the store")
+    try:
+        session = await Session.open(config, fleet)
+    except BaseException:
+        with contextlib.suppress(SwiftbotError):
+            await (await storing).close()
+        raise
+    opened = time.monotonic()
+    try:
+        return session, opened, await storing
+    except BaseException:
+        await session.close()
+        raise
 
 
 def _membership(config: PlaneConfig, session: Session, rpc: Rpc, gateway: str) -> Membership:

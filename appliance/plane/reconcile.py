@@ -45,6 +45,9 @@ _LOST_S = 600.0
 """How long a member that was lost is asked whether it is there after all."""
 _AT_REST = 8
 """Members compared with in a round while nothing changes: all of a small fleet, some of a large one in turn."""
+_FEW = 32
+"""A fleet of so many is small: whoever comes asks all it shares records with before it shows itself, and is asked."""
+_MOST_MET = 4096
 _BREATH = 500
 """Keys looked at before the loop gets a turn."""
 
@@ -106,6 +109,8 @@ class Reconciler:
         self._changed = asyncio.Event()
         self._seen = asyncio.Condition()
         self._turn = 0
+        self._met: frozenset[str] = frozenset()
+        """Gateways that this one has ever been on a ring with, since it started."""
         self._running: asyncio.Task[None] | None = None
         self._waking: set[asyncio.Task[None]] = set()
         rpc.register("dht_digest", DigestAsk, self._on_digest, exchange=False)
@@ -135,7 +140,7 @@ class Reconciler:
         settled: tuple[Ring, int] | None = None
         tries = 0
         wait_s = 0.0
-        tidy = False
+        tidy, handed = False, True
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
@@ -145,17 +150,17 @@ class Reconciler:
             if settled is not None and now != settled and not self._to_compare(settled, ring, stalls):
                 # Others' keys moved. What may have to be handed over waits until a burst of such news is over.
                 settled, tries, wait_s, tidy = now, 0, _AGAIN_S, True
-                await self._dht.settled(ring, stalls)
-                self._tell(self._dht.on_ring_change)
+                await self._settle(ring, stalls)
                 continue
             try:
                 members = [] if tidy and now == settled else self._to_compare(settled, ring, stalls)
-                tidy = False
-                heard, handed, fetched = await self._round(ring, members)
+                heard, fetched = await self._compare(ring, members)
+                if now == settled:
+                    handed = await self._hand_over(ring)
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
                 heard, handed, fetched = False, False, 0
-            wait_s = self._config.anti_entropy_s if heard and handed else _AGAIN_S
+            wait_s, tidy = self._config.anti_entropy_s if heard and handed else _AGAIN_S, False
             if now != (self._membership.ring, self._pulse.stalls):
                 tries, wait_s = 0, 0.0
                 continue
@@ -164,14 +169,19 @@ class Reconciler:
                 if not heard and tries < _TRIES:
                     wait_s = _SOON_S
                     continue
-                settled, tries = now, 0
-                await self._dht.settled(ring, stalls)
-                self._tell(self._dht.on_ring_change)
+                # What belongs elsewhere is handed over next: nobody waits for that.
+                settled, tries, wait_s, tidy = now, 0, _SOON_S, heard
+                await self._settle(ring, stalls)
                 continue
             if fetched:
                 # A member that could not be asked when the ring changed was heard only now: same news.
                 self._tell(self._dht.on_ring_change)
             await self._ask_lost()
+
+    async def _settle(self, ring: Ring, stalls: int) -> None:
+        self._met = ring.members if len(self._met) > _MOST_MET else self._met | ring.members
+        await self._dht.settled(ring, stalls)
+        self._tell(self._dht.on_ring_change)
 
     def _note_lost(self, name: str) -> None:
         self._lost[name] = time.monotonic() + _LOST_S
@@ -200,6 +210,8 @@ class Reconciler:
     def _to_compare(self, settled: tuple[Ring, int] | None, ring: Ring, stalls: int) -> list[str]:
         """With whom: those whom a change of the ring concerns; all that share records after a stall or at first.
 
+        One that was away may have ordered writes on the other side of a cut: whoever shares records with it asks. Of
+        one never seen before that is assumed in a small fleet only: a large one would ask it a hundred times.
         At rest some at a time, in turn: half of those that share records, half of all, since two that lost sight of
         each other learn of it by asking.
         """
@@ -207,7 +219,10 @@ class Reconciler:
         if settled is None or settled[1] != stalls:
             return sorted(sharing(ring, self._gateway, replicas))
         if settled[0] != ring:
-            return sorted(partners(settled[0], ring, self._gateway, replicas))
+            came = ring.members - settled[0].members
+            back = came if len(ring.members) <= _FEW else came & self._met
+            sharers = sharing(ring, self._gateway, replicas) & back if back else frozenset[str]()
+            return sorted(partners(settled[0], ring, self._gateway, replicas) | sharers)
         others = sorted(ring.members - {self._gateway})
         if len(others) <= _AT_REST:
             return others
@@ -215,31 +230,39 @@ class Reconciler:
         near = sorted(sharing(ring, self._gateway, replicas))
         return sorted({*_some(near, self._turn), *_some(others, self._turn)})
 
-    async def _round(self, ring: Ring, members: list[str]) -> tuple[bool, bool, int]:
-        """Compare with these members.
-
-        Returns:
-            Whether all could be asked, whether all that belongs elsewhere was taken, how many records came in.
-        """
-        results = await asyncio.gather(*(self._pull(each, ring) for each in members))
-        handed = await self._hand_over(ring)
-        before_ns = time.time_ns() - int(self._config.tombstone_hours * 3.6e12)
-        await self._store.forget_tombstones(before_ns)
-        heard = all(fetched is not None for fetched in results)
-        return heard, handed, sum(fetched or 0 for fetched in results)
+    async def _compare(self, ring: Ring, members: list[str], *, joining: bool = False) -> tuple[bool, int]:
+        """Compare with these members, and fetch what they have; returns whether all answered, how many records came."""
+        if not members:
+            return True, 0
+        mine = dict(await self._store.digests())
+        shared: dict[str, dict[str, str]] = {each: {} for each in members}
+        for number, (key, digest) in enumerate(mine.items()):
+            replicas = ring.successors(key, self._config.replicas)
+            if self._gateway in replicas:
+                for each in replicas:
+                    if each in shared:
+                        shared[each][key] = digest
+            if number % _BREATH == _BREATH - 1:
+                await asyncio.sleep(0)
+        results = await asyncio.gather(*(self._pull(each, mine, shared[each], joining=joining) for each in members))
+        return all(fetched is not None for fetched in results), sum(fetched or 0 for fetched in results)
 
     async def join(self) -> None:
-        """Fetch what this gateway will own before it shows itself, so that its first requests wait less."""
+        """Fetch what this gateway will own before it shows itself, so that its first requests wait less.
+
+        In a large fleet each of many has little of it, and asking all twice takes longer than it saves.
+        """
         ring = self._membership.ring
         near = sorted(sharing(ring, self._gateway, self._config.replicas))
-        await asyncio.gather(*(self._pull(each, ring, joining=True) for each in near))
+        if len(near) <= _FEW:
+            await self._compare(ring, near, joining=True)
 
     # --- fetching ---------------------------------------------------------------------------------------------
 
-    async def _pull(self, member: str, ring: Ring, *, joining: bool = False) -> int | None:
+    async def _pull(self, member: str, mine: dict[str, str], shared: dict[str, str], *, joining: bool) -> int | None:
         """Fetch what a member has and this gateway lacks; returns how many records, None when it did not answer."""
         try:
-            fetched = await self._pull_from(member, ring, joining=joining)
+            fetched = await self._pull_from(member, mine, shared, joining=joining)
         except SwiftbotError as error:
             if member in self._membership.members:
                 log.warning("could not compare with a member", member=member, reason=str(error))
@@ -249,15 +272,7 @@ class Reconciler:
             log.info("fetched records", member=member, records=fetched)
         return fetched
 
-    async def _pull_from(self, member: str, ring: Ring, *, joining: bool) -> int:
-        mine = dict(await self._store.digests())
-        shared: dict[str, str] = {}
-        for number, (key, each) in enumerate(mine.items()):
-            replicas = ring.successors(key, self._config.replicas)
-            if member in replicas and self._gateway in replicas:
-                shared[key] = each
-            if number % _BREATH == _BREATH - 1:
-                await asyncio.sleep(0)
+    async def _pull_from(self, member: str, mine: dict[str, str], shared: dict[str, str], *, joining: bool) -> int:
         asked = DigestAsk(asker=self._gateway, summary=summary(shared), joining=joining)
         fetched = 0
         while True:
@@ -290,8 +305,12 @@ class Reconciler:
         return done
 
     async def _hand_over(self, ring: Ring) -> bool:
-        """Give copies that belong elsewhere to all their replicas, then drop them; False when one did not take it."""
+        """Give copies that belong elsewhere to all their replicas, then drop them; False when one did not take it.
+
+        Removals of long ago are forgotten by the way.
+        """
         complete = True
+        await self._store.forget_tombstones(time.time_ns() - int(self._config.tombstone_hours * 3.6e12))
         for number, (key, _) in enumerate(await self._store.digests()):
             if number % _BREATH == _BREATH - 1:
                 await asyncio.sleep(0)

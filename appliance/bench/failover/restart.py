@@ -33,7 +33,7 @@ from appliance.pool.settings import PoolConfig
 GOAL_MS = 31.0
 STEP_S = 60.0
 """For a gateway to end, or to come back."""
-STAGES = ("store_ms", "joined_ms", "reconciled_ms")
+STAGES = ("linked_ms", "present_ms", "fetched_ms", "joined_ms", "reconciled_ms")
 
 
 class Options(Struct, frozen=True, kw_only=True):

@@ -179,7 +179,7 @@ class _Rounds:
     async def _submit(self, prefix: str) -> list[str]:
         steps = (
             Subtask(id="s1", skill=SKILL, params={"service_ms": self._options.sleep_ms}),
-            Subtask(id="s2", skill=SKILL, params={"service_ms": 0.0}, after=("s1",)),
+            Subtask(id="s2", skill=SKILL, params={"service_ms": 1.0}, after=("s1",)),
         )
         names = [f"{prefix}-{number}" for number in range(self._options.tasks)]
         for name in names:
@@ -199,9 +199,11 @@ class _Rounds:
             ]
             if len(under_way) >= len(names) // 2 or (under_way and time.monotonic() > give_up - STEP_S / 2):
                 return under_way
-            if time.monotonic() > give_up:
+            failed = [each for each in records if each.failure is not None]
+            if failed or time.monotonic() > give_up:
                 states = Counter(str(each.state) for each in records)
-                raise DeadlineError(f"the tasks do not run: {dict(states)}", remedy="see the gateways' logs")
+                why = failed[0].failure.message if failed and failed[0].failure is not None else ""
+                raise DeadlineError(f"the tasks do not run: {dict(states)} {why}", remedy="see the gateways' logs")
             await asyncio.sleep(0.05)
 
     async def _lost(self, tails: dict[str, LogTail], victim: str) -> dict[str, float]:

@@ -22,7 +22,7 @@ import uvloop
 from msgspec import Struct
 
 from appliance import logs
-from appliance.errors import SwiftbotError
+from appliance.errors import SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
@@ -30,6 +30,7 @@ from appliance.plane.settings import PlaneConfig
 STATUS_S = 2.0
 """How often a gateway gives an account of itself when nothing changes; the registry decides what is told of it."""
 _LOOK_S = 0.02
+_TRIES = 5
 _IMAGES = ("base", "vision")
 
 
@@ -75,12 +76,24 @@ class Host:
                 connect_timeout_s=20.0,
             )  # fmt: skip
             began = time.monotonic()
-            plane = await Plane.open(config, fleet=options.fleet, gateway=name, data_dir=Path(options.folder) / name)
+            plane = await self._open_one(config, name)
             self._planes[name] = plane
             opened[name] = {"began": began, **plane.milestones}
             self._watch(name, plane)
             self._publishing.append(asyncio.create_task(self._keep_publishing(name, plane)))
         return opened
+
+    async def _open_one(self, config: PlaneConfig, name: str) -> Plane:
+        """Open a member; a router that is busy with hundreds of others may take more than one try to answer."""
+        for attempt in range(_TRIES):
+            try:
+                return await Plane.open(
+                    config, fleet=self._options.fleet, gateway=name, data_dir=Path(self._options.folder) / name
+                )
+            except UnreachableError:
+                if attempt == _TRIES - 1:
+                    raise
+        raise AssertionError
 
     def _watch(self, name: str, plane: Plane) -> None:
         def came(other: str) -> None:
