@@ -22,7 +22,7 @@ from appliance.plane.membership import Membership
 from appliance.plane.pulse import Pulse
 from appliance.plane.quorum.voting import Voting
 from appliance.plane.ring import Ring
-from appliance.plane.rpc import Rpc
+from appliance.plane.rpc import AtOnce, Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 from appliance.plane.versions import (
@@ -125,9 +125,11 @@ class Dht:
         self._settled = Ring((), virtual_nodes=config.virtual_nodes)
         self._settling = asyncio.Condition()
         self._pushes: set[asyncio.Task[None]] = set()
-        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False)
+        self._unsaved: set[str] = set()
+        """Keys whose last decision here the replicas may have and the disk has not."""
+        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, at_once=self._read_at_once)
         rpc.register("dht_write", Write, self._on_write, exchange=False)
-        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False)
+        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, at_once=self._store_at_once)
         rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
         rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
 
@@ -153,7 +155,9 @@ class Dht:
                 if gateway == self._gateway:
                     record = (await self._on_read(KeyAsk(key))).record
                 else:
-                    found = await self._rpc.call(gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S)
+                    found = await self._rpc.call(
+                        gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S, direct=True
+                    )
                     record = found.record
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 problem = error
@@ -219,7 +223,7 @@ class Dht:
                 (owner,) = await self._membership.holders(asked.key, 1)
                 if owner == self._gateway:
                     return (await self._on_write(asked)).version
-                answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S)
+                answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 # Dead, not yet known to be; or of another mind about who owns the key: both pass.
                 if loop.time() > until:
@@ -237,33 +241,51 @@ class Dht:
             owner = self._membership.ring.owner(asked.key)
             raise RefusedError(f"{asked.key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
         await self._until_settled(asked.key)
+        if asked.key in self._unsaved:
+            await self._catch_up(asked.key)
         try:
-            record = await self._decide(asked)
+            record, committed = await self._decide(asked)
         except Behind:
             await self._catch_up(asked.key)
             try:
-                record = await self._decide(asked)
+                record, committed = await self._decide(asked)
             except Behind:
                 raise ConflictError(
                     f"{asked.key}: nobody here knows the version expected", remedy="read it and decide again"
                 ) from None
-        return Written(await self._replicate(record, asked))
+        return Written(await self._replicate(record, asked, committed))
 
-    async def _decide(self, asked: Write) -> Record:
+    async def _decide(self, asked: Write) -> tuple[Record, asyncio.Future[Record | None]]:
+        """Decide as the owner; returns the record, and what ends when it is committed here."""
+
         def order(current: Record | None) -> Record:
             if self._pulse.doubtful:
                 raise RefusedError(f"{self._gateway} stood still and may have been succeeded", remedy="ask again")
             return decide(current, asked, self._gateway)
 
-        record = await self._store.change(asked.key, order, durable=asked.durable)
+        decided, committed = self._store.change_soon(asked.key, order, durable=asked.durable)
+        record = await decided
         if record is None:
             raise SwiftbotError("a decision without a record")
-        return record
+        return record, committed
 
-    async def _replicate(self, record: Record, asked: Write) -> VersionVector:
-        """Have the other replicas store a record; returns its version once they and this gateway agree."""
+    async def _replicate(self, record: Record, asked: Write, committed: asyncio.Future[Record | None]) -> VersionVector:
+        """Have the other replicas store a record while this one commits it.
+
+        Returns:
+            Its version, once they and this gateway agree.
+        """
         others = [each for each in self._replicas(record.key) if each != self._gateway]
-        answers = await asyncio.gather(*(self._push(each, record) for each in others))
+        pushed = asyncio.gather(*(self._push(each, record) for each in others))
+        try:
+            await committed
+        except BaseException as error:
+            pushed.cancel()
+            if isinstance(error, SwiftbotError):
+                # The replicas may have it: before the next decision on this key they are asked.
+                self._unsaved.add(record.key)
+            raise
+        answers = await pushed
         newer = [answer for answer in answers if answer is not None]
         if not newer:
             return record.version
@@ -279,7 +301,8 @@ class Dht:
         """Have a replica store a record; returns what it holds if that is something else."""
         timeout_s = self._config.replica_timeout_s
         try:
-            answer = await self._rpc.call(gateway, "dht_store", StoreAsk(record), Found, timeout_s=timeout_s)
+            ask = StoreAsk(record)
+            answer = await self._rpc.call(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
         except UnreachableError:
             return None  # gone: its successor in the replica set takes the record when it reconciles
         except (DeadlineError, RefusedError) as error:
@@ -341,6 +364,7 @@ class Dht:
         # One more than the replicas: the owner before the last change of membership may hold it.
         near = self._membership.ring.successors(key, self._config.replicas + 1)
         await asyncio.gather(*(ask(each) for each in near if each != self._gateway))
+        self._unsaved.discard(key)
 
     # --- answering --------------------------------------------------------------------------------------------
 
@@ -349,6 +373,28 @@ class Dht:
         if self.owns(asked.key):
             await self._until_settled(asked.key)
         return Found(await self._store.record(asked.key))
+
+    def _read_at_once(self, asked: KeyAsk, answer: AtOnce) -> bool:
+        """Answer a read on Zenoh's thread, where the ring is known whole and the record is in memory."""
+        if self._config.view != "full" or (self._membership.owns(check_key(asked.key)) and not self._mine(asked.key)):
+            return False
+        known, record = self._store.look(asked.key)
+        if known:
+            answer(Found(record))
+        return known
+
+    def _store_at_once(self, asked: StoreAsk, answer: AtOnce) -> bool:
+        """Have the store's thread keep a record and answer, without a turn of the event loop."""
+        record = check_record(asked.record, max_bytes=self._config.max_record_bytes)
+
+        def done(kept: Record | None, error: Exception | None) -> None:
+            if error is not None:
+                answer(error if isinstance(error, SwiftbotError) else SwiftbotError(f"not stored: {error}"))
+            else:
+                answer(Found(None if kept == record else kept))
+
+        self._store.change_then(record.key, partial(_settle, record, self.resolver or by_bytes), done)
+        return True
 
     async def _on_store(self, asked: StoreAsk) -> Found:
         check_record(asked.record, max_bytes=self._config.max_record_bytes)
@@ -390,18 +436,19 @@ class Dht:
         async with self._settling:
             self._settling.notify_all()
 
+    def _mine(self, key: str) -> bool:
+        """Whether a key was this gateway's when it last reconciled; from any thread."""
+        settled = self._settled
+        known = bool(settled.members) and self._stalls == self._pulse.stalls
+        return known and settled.owner(key) == self._gateway
+
     async def _until_settled(self, key: str) -> None:
         """Wait until this gateway has reconciled as the key's owner; it may have become that just now."""
-
-        def mine() -> bool:
-            known = bool(self._settled.members) and self._stalls == self._pulse.stalls
-            return known and self._settled.owner(key) == self._gateway
-
-        if mine():
+        if self._mine(key):
             return
         try:
             async with asyncio.timeout(_SETTLE_S), self._settling:
-                await self._settling.wait_for(mine)
+                await self._settling.wait_for(partial(self._mine, key))
         except TimeoutError:
             log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
 

@@ -55,6 +55,24 @@ def reply(
             query.reply(key, answer, encoding="application/json", express=True)
 
 
+MARK = b"direct "
+"""Before the key in the attachment of a direct question: it is dropped rather than waited for when a link is full, and so is its answer
+(Zenoh gives an answer the question's congestion control), so that both may be sent from any thread."""
+MOST_DIRECT = 32 * 1024
+"""Larger messages are sent in fragments, and one that is dropped loses all."""
+
+
+def is_direct(query: zenoh.Query) -> bool:
+    """Whether the answer to a question never blocks."""
+    mark = query.attachment
+    return mark is not None and mark.to_bytes().startswith(MARK)
+
+
+def reply_direct(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None) -> None:
+    """Answer a direct question, on whatever thread; an answer too large for it is empty: ask the other way."""
+    reply(query, expr, b"" if answer is not None and len(answer) > MOST_DIRECT else answer, error)
+
+
 def quietly(send: Callable[[], None], key: str) -> None:
     """Send; a failure (the session is closing, the key is no key) is logged."""
     try:
@@ -100,6 +118,10 @@ def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
         "transport/link/tx/keep_alive": 4,
         # A peer that takes nothing for a lease is as good as dead: its link is closed and the sender goes on.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": config.lease_ms * 1000,
+        # Direct questions and their answers have a priority of their own, and room for a burst of them; a full link
+        # holds up whoever sends one for so long at most, in microseconds.
+        "transport/link/tx/queue/size/data_high": 16,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
         # Zenoh's own 1,000 is less than a large fleet with its robots and clients on one router.
         "transport/unicast/max_sessions": 10_000 if config.mode == "router" else 1000,
         "transport/link/rx/max_message_size": config.max_payload_bytes * _WIRE_HEADROOM,

@@ -7,6 +7,7 @@ any Zenoh client can see it; what would be too large there is named by its diges
 import hashlib
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import msgspec
@@ -14,10 +15,13 @@ from msgspec import Raw, Struct
 
 from appliance.errors import ConfigError, PayloadError, SwiftbotError
 from appliance.model import ErrorReply, encode
-from appliance.plane.session import Closer, Session
+from appliance.plane.session import Answer, Closer, Session
 
 Q = TypeVar("Q", bound=Struct)
 R = TypeVar("R", bound=Struct)
+
+AtOnce = Callable[[Struct | SwiftbotError], None]
+"""Answers a direct call, from any thread."""
 
 _EXCHANGE_BYTES = 32 * 1024
 """A request or reply larger than this appears in its exchange record by size and digest only."""
@@ -52,9 +56,18 @@ class Rpc:
         self._closers: list[Closer] = []
 
     def register(
-        self, verb: str, request: type[Q], handler: Callable[[Q], Awaitable[Struct]], *, exchange: bool = True
+        self,
+        verb: str,
+        request: type[Q],
+        handler: Callable[[Q], Awaitable[Struct]],
+        *,
+        exchange: bool = True,
+        at_once: Callable[[Q, AtOnce], bool] | None = None,
     ) -> None:
-        """Answer a verb. `exchange=False` is for the plane's own traffic, which would repeat what is put anyway."""
+        """Answer a verb. `exchange=False` is for the plane's own traffic, which would repeat what is put anyway.
+
+        `at_once` is tried first for direct calls, on a thread of Zenoh's (`Session.serve`); bad input is the handler's.
+        """
         gateway = self._gateway
         if gateway is None or verb in self._verbs:
             raise ConfigError(f"the verb {verb} cannot be served here")
@@ -81,9 +94,10 @@ class Rpc:
             self._publish(verb, gateway, payload, began, reply)
             return reply
 
+        quick = None if at_once is None else partial(_at_once, msgspec.json.Decoder(request), at_once)
         self._verbs[verb] = serve
         key = self._session.keys.rpc(gateway, verb)
-        self._closers.append(self._session.serve(key, lambda _, payload: serve(payload)))
+        self._closers.append(self._session.serve(key, lambda _, payload: serve(payload), at_once=quick))
 
     def _publish(self, verb: str, gateway: str, payload: bytes, began: float, outcome: bytes | Exception) -> None:
         reply, error = (outcome, None) if isinstance(outcome, bytes) else (None, _failure(outcome))
@@ -97,10 +111,19 @@ class Rpc:
         )
         self._session.put(self._session.keys.exchange(gateway, verb), encode(record))
 
-    async def call(self, gateway: str, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0) -> R:
-        """Ask a gateway; errors are those of `Session.query`, and PayloadError when the answer is no `reply`."""
+    async def call(
+        self,
+        gateway: str,
+        verb: str,
+        request: Struct,
+        reply: type[R],
+        *,
+        timeout_s: float = 5.0,
+        direct: bool = False,
+    ) -> R:
+        """Ask a gateway; `direct` and errors as of `Session.query`, and PayloadError when the answer is no `reply`."""
         key = self._session.keys.rpc(gateway, verb)
-        answer = await self._session.query(key, encode(request), timeout_s=timeout_s)
+        answer = await self._session.query(key, encode(request), timeout_s=timeout_s, direct=direct)
         try:
             return msgspec.json.decode(answer, type=reply)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -111,6 +134,23 @@ class Rpc:
         """Answer no more."""
         for closer in self._closers:
             closer.close()
+
+
+def _at_once(
+    decoder: msgspec.json.Decoder[Q], handler: Callable[[Q, AtOnce], bool], payload: bytes, answer: Answer
+) -> bool:
+    """Decode and answer on the thread that is here; False: the handler on the event loop has to."""
+
+    def tell(outcome: Struct | SwiftbotError) -> None:
+        if isinstance(outcome, SwiftbotError):
+            answer(None, outcome)
+        else:
+            answer(encode(outcome), None)
+
+    try:
+        return handler(decoder.decode(payload), tell)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, SwiftbotError):
+        return False  # it will be refused there, and counted
 
 
 def _failure(error: Exception) -> ErrorReply:

@@ -31,6 +31,9 @@ log = structlog.get_logger(__name__)
 
 T = TypeVar("T")
 
+Answer = Callable[[bytes | None, SwiftbotError | None], None]
+"""Answers one query, from any thread."""
+
 _CLOSE_S = 2.0
 """How long a closing session keeps sending what waits."""
 
@@ -200,10 +203,19 @@ class Session:
 
     # --- questions --------------------------------------------------------------------------------------------
 
-    def serve(self, expr: str, handler: Callable[[str, bytes], Awaitable[bytes]], *, bulk: bool = False) -> Closer:
+    def serve(
+        self,
+        expr: str,
+        handler: Callable[[str, bytes], Awaitable[bytes]],
+        *,
+        bulk: bool = False,
+        at_once: Callable[[bytes, Answer], bool] | None = None,
+    ) -> Closer:
         """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
 
         `bulk`: answers are raw bytes and wait in a queue of their own; their priority is that of the question.
+        `at_once`: tried first for direct questions, on Zenoh's own thread: it must neither block nor touch what
+        belongs to the event loop. It says whether it answers, or has another thread answer; if not, the handler does.
 
         A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
         and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
@@ -218,6 +230,7 @@ class Session:
             key, payload = str(query.key_expr), query.payload
             size = len(payload) if payload is not None else 0
             meant = query.attachment.to_bytes() if query.attachment is not None else b""
+            direct, meant = meant.startswith(link.MARK), meant.removeprefix(link.MARK)
             if meant and "*" not in expr and meant != expr.encode():
                 error = UnreachableError(f"{expr}: the question is not for this", remedy="ask again in a moment")
                 begin = partial(self._refuse_query, f"misrouted {name}", query, expr, error)
@@ -228,6 +241,8 @@ class Session:
                 size = 0
             else:
                 data = payload.to_bytes() if payload is not None else b""
+                if at_once is not None and direct and at_once(data, partial(link.reply_direct, query, expr)):
+                    return
                 begin = partial(answer, key, data, query)
             if not self._inbox.post(begin, size):
                 link.reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
@@ -275,6 +290,8 @@ class Session:
             size = len(reply) if reply is not None and error is None else 0
             if self._closed:
                 link.reply(query, expr, reply, error)
+            elif link.is_direct(query):
+                link.reply_direct(query, expr, reply, error)
             else:
                 self._send(key, partial(link.reply, query, expr, reply, error, bulk=bulk), size, bulk=bulk)
 
@@ -282,8 +299,13 @@ class Session:
         self.refuse(what, key=str(query.key_expr), reason=str(error))
         self._send(expr, partial(link.reply, query, expr, None, error), 0)
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False) -> bytes:
+    async def query(
+        self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
+    ) -> bytes:
         """Ask whoever serves a key and return the first answer; `bulk`: other messages go before it.
+
+        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full. For small
+        questions that can be asked again, where the way there and back matters.
 
         Raises:
             UnreachableError: nobody serves the key, or whoever did went away before answering.
@@ -291,6 +313,8 @@ class Session:
             PayloadError: the request or the answer is too large.
             SwiftbotError: what the answering side raised.
         """
+        direct = direct and len(payload) <= link.MOST_DIRECT
+        until = self._loop.time() + timeout_s
         answer: asyncio.Future[bytes] = self._loop.create_future()
         self._asking.add(answer)
 
@@ -309,14 +333,19 @@ class Session:
 
         try:
             target = zenoh.QueryTarget.BEST_MATCHING
-            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, meant=key.encode())
-            async with asyncio.timeout(timeout_s):
-                return await answer
+            meant = link.MARK + key.encode() if direct else key.encode()
+            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, direct=direct, meant=meant)
+            async with asyncio.timeout_at(until):
+                data = await answer
+            if data or not direct:
+                return data
         except TimeoutError:
             raise DeadlineError(f"no answer on {key} within {timeout_s:g} s") from None
         finally:
             self._asking.discard(answer)
             answer.cancel()
+        # The answer is too large to be sent so.
+        return await self.query(key, payload, timeout_s=max(0.0, until - self._loop.time()), bulk=bulk)
 
     async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
         """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out."""
@@ -345,6 +374,7 @@ class Session:
         *,
         target: zenoh.QueryTarget,
         bulk: bool = False,
+        direct: bool = False,
         meant: bytes | None = None,
     ) -> None:
         limit = self.config.max_payload_bytes
@@ -366,6 +396,8 @@ class Session:
                 data = sample.payload.to_bytes()
                 self._inbox.post(partial(on_reply, str(sample.key_expr), data, None), size, must=True)
 
+        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
+        control = zenoh.CongestionControl
         send = partial(
             self._raw.get,
             expr,
@@ -374,13 +406,16 @@ class Session:
             consolidation=zenoh.ConsolidationMode.NONE,
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
             timeout=timeout_s + 1.0,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA,
+            congestion_control=control.DROP if direct else control.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH if direct else priority,
             express=True,
             payload=payload,
             attachment=meant,
         )
-        self._send(expr, cast("Callable[[], None]", send), len(payload))
+        if direct:
+            link.quietly(cast("Callable[[], None]", send), expr)
+        else:
+            self._send(expr, cast("Callable[[], None]", send), len(payload))
 
     # --- presence ---------------------------------------------------------------------------------------------
 

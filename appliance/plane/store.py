@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -22,6 +23,7 @@ import structlog
 
 from appliance.errors import ConfigError, PrerequisiteError, RefusedError, SwiftbotError
 from appliance.model import VersionVector
+from appliance.plane.picture import Picture
 from appliance.plane.versions import Record, digest
 
 log = structlog.get_logger(__name__)
@@ -44,7 +46,8 @@ CREATE TABLE IF NOT EXISTS kept (key TEXT PRIMARY KEY, value BLOB NOT NULL);
 
 class _Call(NamedTuple):
     run: Callable[[sqlite3.Connection], Any]
-    done: asyncio.Future[Any]
+    done: Callable[[Any, Exception | None], None]
+    """Told on the store's thread, after the commit."""
     writes: bool
     durable: bool
 
@@ -62,6 +65,9 @@ class Store:
         self._closing = False
         self._lock = -1
         self._synchronous = ""
+        self._picture = Picture()
+        self._changed: list[Record | str] = []
+        """What the open transaction has put (records) and dropped (keys)."""
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
         self._opened: asyncio.Future[None] = loop.create_future()
 
@@ -114,9 +120,21 @@ class Store:
 
     # --- records ----------------------------------------------------------------------------------------------
 
+    def look(self, key: str) -> tuple[bool, Record | None]:
+        """Whether a record is known without asking the disk, and it; from any thread."""
+        return self._picture.look(key)
+
     async def record(self, key: str) -> Record | None:
         """Return a record, a tombstone too."""
-        return await self._call(lambda db: _record(db, key))
+        known, record = self._picture.look(key)
+        return record if known else await self._call(partial(self._read_record, key))
+
+    def _read_record(self, key: str, db: sqlite3.Connection) -> Record | None:
+        record = _record(db, key)
+        # Within a transaction it may be one that is not committed.
+        if record is not None and not db.in_transaction:
+            self._picture.read(record)
+        return record
 
     async def records(self, prefix: str) -> list[Record]:
         """Return every record with that prefix, tombstones too, in order of keys."""
@@ -136,34 +154,90 @@ class Store:
         `decide` runs on the store's thread and must be pure: it may be run again. What it raises is raised here.
         Returns what it returned; nothing is written when that is None or what is stored already.
         """
+        return await self._call(partial(self._change, key, decide), writes=True, durable=durable)
+
+    def change_soon(
+        self, key: str, decide: Callable[[Record | None], Record | None], *, durable: bool = True
+    ) -> tuple[asyncio.Future[Record | None], asyncio.Future[Record | None]]:
+        """Do the same; returns what was decided, as soon as it is, and the same once it is committed.
+
+        The two fail alike; when only the second does, the decision was made and the disk did not take it.
+        """
+        decided: asyncio.Future[Record | None] = self._loop.create_future()
+        committed: asyncio.Future[Record | None] = self._loop.create_future()
+        # Who awaits the first need not look at the second when that has failed.
+        committed.add_done_callback(_looked_at)
 
         def run(db: sqlite3.Connection) -> Record | None:
-            current = _record(db, key)
-            decided = decide(current)
-            if decided is not None and decided != current:
-                db.execute(
-                    "INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    (
-                        key,
-                        decided.value,
-                        msgspec.json.encode(decided.version).decode(),
-                        decided.deleted,
-                        decided.write,
-                        digest(decided),
-                        time.time_ns(),
-                    ),
-                )
-            return decided
+            record = self._change(key, decide, db)
+            self._post(decided, record, None)
+            return record
 
-        return await self._call(run, writes=True, durable=durable)
+        def done(record: Record | None, error: Exception | None) -> None:
+            self._post(decided, record, error)
+            self._post(committed, record, error)
+
+        self._submit(_Call(run, done, writes=True, durable=durable))
+        return decided, committed
+
+    def change_then(
+        self,
+        key: str,
+        decide: Callable[[Record | None], Record | None],
+        done: Callable[[Record | None, Exception | None], None],
+    ) -> None:
+        """Do the same, from any thread; `done` is told on the store's thread, once it is committed.
+
+        Raises:
+            RefusedError: the store is closed, or too much waits for the disk.
+        """
+        self._submit(_Call(partial(self._change, key, decide), done, writes=True, durable=True))
+
+    def _change(
+        self, key: str, decide: Callable[[Record | None], Record | None], db: sqlite3.Connection
+    ) -> Record | None:
+        current = self._current(key, db)
+        decided = decide(current)
+        if decided is not None and decided != current:
+            db.execute(
+                "INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (
+                    key,
+                    decided.value,
+                    msgspec.json.encode(decided.version).decode(),
+                    decided.deleted,
+                    decided.write,
+                    digest(decided),
+                    time.time_ns(),
+                ),
+            )
+            self._changed.append(decided)
+        return decided
+
+    def _current(self, key: str, db: sqlite3.Connection) -> Record | None:
+        """The record as the open transaction sees it."""
+        for change in reversed(self._changed):
+            if isinstance(change, str):
+                if change == key:
+                    return None
+            elif change.key == key:
+                return change
+        known, record = self._picture.look(key)
+        return record if known else _record(db, key)
 
     async def forget(self, record: Record) -> None:
         """Drop a copy that belongs elsewhere, if it is still that version."""
-        await self._execute("DELETE FROM records WHERE key = ? AND digest = ?", record.key, digest(record))
+        await self._drop("DELETE FROM records WHERE key = ? AND digest = ? RETURNING key", record.key, digest(record))
 
     async def forget_tombstones(self, before_ns: int) -> None:
         """Drop removals older than that (Unix nanoseconds, this machine's clock)."""
-        await self._execute("DELETE FROM records WHERE deleted AND updated_ns < ?", before_ns, durable=False)
+        await self._drop("DELETE FROM records WHERE deleted AND updated_ns < ? RETURNING key", before_ns, durable=False)
+
+    async def _drop(self, sql: str, *values: Any, durable: bool = True) -> None:
+        def run(db: sqlite3.Connection) -> None:
+            self._changed += [row[0] for row in db.execute(sql, values).fetchall()]
+
+        await self._call(run, writes=True, durable=durable)
 
     # --- the thread -------------------------------------------------------------------------------------------
 
@@ -174,7 +248,11 @@ class Store:
         await self._call(lambda db: db.execute(sql, values) and None, writes=True, durable=durable)
 
     async def _call(self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True) -> T:
-        done: asyncio.Future[Any] = self._loop.create_future()
+        future: asyncio.Future[Any] = self._loop.create_future()
+        self._submit(_Call(run, partial(self._post, future), writes, durable))
+        return cast("T", await future)
+
+    def _submit(self, call: _Call) -> None:
         with self._some:
             if self._closing:
                 raise RefusedError("the store is closed")
@@ -182,13 +260,13 @@ class Store:
                 raise RefusedError(
                     f"{len(self._waiting)} calls wait for the disk", remedy="the disk is too slow or fails"
                 )
-            self._waiting.append(_Call(run, done, writes, durable))
+            self._waiting.append(call)
             self._some.notify()
-        return cast("T", await done)
 
     def _run(self) -> None:
         try:
             db = self._connect()
+            self._picture = Picture(row[0] for row in db.execute("SELECT key FROM records"))
         except Exception as error:  # noqa: BLE001 - supervision boundary: whatever went wrong must reach the caller of `open`
             self._post(self._opened, None, error)
             return
@@ -219,10 +297,14 @@ class Store:
             log.error("the store failed", path=str(self.path), reason=str(problem))  # noqa: TRY400 - cause named
             outcomes = [(None, problem)]
         for call, (result, error) in zip(batch, outcomes, strict=True):
-            self._post(call.done, result, error)
+            try:
+                call.done(result, error)
+            except Exception:  # supervision boundary: one caller's defect must not end the thread of all
+                log.exception("who waited for the store failed")
 
     def _commit(self, db: sqlite3.Connection, batch: list[_Call]) -> list[tuple[Any, Exception | None]]:
         writes = any(call.writes for call in batch)
+        self._changed.clear()
         if writes:
             self._set_synchronous(db, "FULL" if any(call.durable for call in batch if call.writes) else "NORMAL")
             db.execute("BEGIN IMMEDIATE")
@@ -237,12 +319,23 @@ class Store:
                     outcomes.append((None, error))
             if writes:
                 db.execute("COMMIT")
+                self._show()
         except BaseException:
+            self._changed.clear()
             if db.in_transaction:
                 with contextlib.suppress(sqlite3.Error):
                     db.execute("ROLLBACK")
             raise
         return outcomes
+
+    def _show(self) -> None:
+        """Have the picture follow a commit."""
+        for change in self._changed:
+            if isinstance(change, str):
+                self._picture.drop(change)
+            else:
+                self._picture.put(change)
+        self._changed.clear()
 
     def _set_synchronous(self, db: sqlite3.Connection, mode: str) -> None:
         if mode != self._synchronous:
@@ -366,6 +459,11 @@ def _from_row(row: tuple[str, bytes, str, int, str]) -> Record:
         deleted=bool(deleted),
         write=write,
     )
+
+
+def _looked_at(future: asyncio.Future[Record | None]) -> None:
+    if not future.cancelled():
+        future.exception()
 
 
 def _prefixed(prefix: str) -> tuple[str, tuple[str, ...]]:
