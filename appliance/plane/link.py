@@ -122,6 +122,7 @@ def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
         # holds up whoever sends one for so long at most, in microseconds.
         "transport/link/tx/queue/size/data_high": 16,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": config.lease_ms * 1000,
         # Zenoh's own 1,000 is less than a large fleet with its robots and clients on one router.
         "transport/unicast/max_sessions": 10_000 if config.mode == "router" else 1000,
         "transport/link/rx/max_message_size": config.max_payload_bytes * _WIRE_HEADROOM,
