@@ -56,8 +56,8 @@ def reply(
 
 
 MARK = b"direct "
-"""Before the key in the attachment of a direct question: it is dropped rather than waited for when a link is full, and so is its answer
-(Zenoh gives an answer the question's congestion control), so that both may be sent from any thread."""
+"""Before the key in the attachment of a direct question: it is dropped rather than waited for when a link is full, and
+so is its answer (Zenoh gives an answer the question's congestion control), so that both may be sent from any thread."""
 MOST_DIRECT = 32 * 1024
 """Larger messages are sent in fragments, and one that is dropped loses all."""
 
