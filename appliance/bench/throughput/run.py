@@ -231,7 +231,7 @@ async def _kill_worker(load: Load, client: FleetClient) -> float:
 async def _pid_of(container: str) -> int:
     """Return the process id of a container's first process, as the machine sees it."""
     process = await asyncio.create_subprocess_exec(
-        "podman", "inspect", "--format", "{{.State.Pid}}", container,
+        "podman", "ps", "--filter", f"label=swiftbot.id={container}", "--format", "{{.Pid}}",
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
     out, problem = await process.communicate()
