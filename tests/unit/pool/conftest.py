@@ -64,6 +64,13 @@ def run(ctx):
         raise ctx.Fail("no light", remedy="switch it on", retryable=True)
     if do == "raise":
         raise ValueError("bad value")
+    if do == "save when due":
+        ctx.checkpoint({"first": 1})
+        Path(ctx.params["pid"]).write_text(str(os.getpid()))
+        while not ctx.checkpoint_due():
+            time.sleep(0.005)
+        ctx.checkpoint({"last": 2})
+        return {"due": ctx.checkpoint_due()}
     if do == "sleep":
         Path(ctx.params["pid"]).write_text(str(os.getpid()))
         time.sleep(60)

@@ -393,3 +393,30 @@ def test_environment_is_clean() -> None:
     text = "".join(file.read_text() for file in folder.glob("*.py"))
     assert "appliance." not in text.replace("the appliance.", "")
     assert (folder / "main.py").exists()
+
+
+async def test_a_handler_that_asks_is_told_when_a_checkpoint_is_wanted(zygote: Zygote, tmp_path: Path) -> None:
+    """`save` reaches the run of that id alone; having saved it is wanted no more; others are not disturbed by it."""
+    control, connection = await zygote(), await zygote()
+    params = {"do": "save when due", "pid": str(tmp_path / "pid")}
+    await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": params, "timeout_s": 20.0})
+    await _wait_for(tmp_path / "pid")
+    await control.send({"op": "save", "run": "r9"})
+    assert (await control.receive())["ok"] is False
+    await control.send({"op": "save", "run": "r1"})
+    assert (await control.receive())["ok"] is True
+    frames = await _finish(connection)
+    assert [frame["data"] for frame in frames if frame["ev"] == "checkpoint"] == [{"first": 1}, {"last": 2}]
+    assert frames[-1]["result"] == {"due": False}
+    await _wait_free(zygote)
+    asleep = await zygote()
+    params = {"do": "sleep", "pid": str(tmp_path / "other")}
+    await asleep.send({"op": "run", "run": "r2", "skill": "probe", "params": params, "timeout_s": 20.0})
+    pid = int(await _wait_for(tmp_path / "other"))
+    await control.send({"op": "save", "run": "r2"})
+    assert (await control.receive())["ok"] is True
+    await control.send({"op": "ping"})
+    assert (await control.receive())["run"] == "r2"
+    assert not _gone(pid), "a handler that does not ask goes on"
+    await control.send({"op": "cancel", "run": "r2", "reason": "cancelled", "grace_s": 0.1})
+    await _finish(asleep)

@@ -176,3 +176,49 @@ def test_concurrent_checkpoints_settle_alike_everywhere(one: bytes, two: bytes, 
         return
     winner = msgspec.json.decode(stronger(one, two), type=Checkpoint)
     assert winner.attempt == max(each.attempt for each in found)
+
+
+RUN = ("t-1", "s1", 1)
+
+
+async def test_a_fresh_checkpoint_is_written_at_once(told: Told) -> None:
+    """Not only when the pause between writes is over; and it says whether it came for the asking."""
+    told.add({"at": 1})
+    await told.kept()
+
+    async def ask() -> bool:
+        told.add({"at": 2})
+        return True
+
+    async with asyncio.timeout(0.9):  # the pause is a second
+        assert await told.checkpoints.fresh(RUN, ask, wait_s=5.0, may_save=True)
+    assert await kept(told.dht) == {"at": 2}
+    assert told.checkpoints.any_of(RUN)
+
+
+async def test_a_handler_that_saves_nothing_is_not_waited_for_long(told: Told) -> None:
+    """What it saved before is written all the same; one whose skill never saves is not even asked."""
+    asked: list[int] = []
+
+    async def deaf() -> bool:
+        asked.append(1)
+        return True
+
+    assert not await told.checkpoints.fresh(RUN, deaf, wait_s=0.05, may_save=False)
+    assert not asked
+    told.add({"at": 1})
+    assert not await told.checkpoints.fresh(RUN, deaf, wait_s=0.05, may_save=False)
+    assert asked == [1]
+    assert await kept(told.dht) == {"at": 1}
+
+
+async def test_a_checkpoint_that_cannot_be_written_does_not_hold_a_move_up(told: Told, plane: Any) -> None:
+    """The run goes on from the one before, after the time it is given."""
+    plane.dht.break_next = [UnreachableError("no owner")]
+
+    async def ask() -> bool:
+        told.add({"at": 1})
+        return True
+
+    assert not await told.checkpoints.fresh(RUN, ask, wait_s=0.05, may_save=True)
+    assert await kept(told.dht) is None
