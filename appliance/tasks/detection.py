@@ -22,10 +22,11 @@ from appliance.skills.catalogue import SkillManifest
 class DetectionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When a run is taken for stuck or straggling."""
 
-    stuck_factor: float = 3.0
-    """A silent run is stuck after so many times what runs of its skill take (at the quantile)."""
-    stuck_minimum_s: float = 30.0
-    """Never before, unless the manifest promises signs of life more often: a robot may be on its way that long."""
+    stuck_factor: float = 6.0
+    """A silent run of a skill that promises no signs of life is stuck after so many times what runs of it take (at the
+    quantile): ending one that only has more to do than usual costs more than waiting."""
+    stuck_minimum_s: float = 60.0
+    """Never before, unless the manifest promises signs of life more often."""
     straggler_factor: float = 2.0
     """A run straggles after so many times what others take (Spark's `speculation.multiplier` is 1.5, later 3)."""
     straggler_minimum_s: float = 5.0

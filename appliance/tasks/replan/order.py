@@ -1,8 +1,9 @@
 """Subtasks in an order in which they can be done; what comes before what."""
 
+import hashlib
 from collections.abc import Iterable
 
-from appliance.model import Subtask
+from appliance.model import Subtask, TaskRecord
 
 
 def in_order(subtasks: Iterable[Subtask]) -> tuple[Subtask, ...]:
@@ -34,14 +35,20 @@ def before(subtask: str, subtasks: Iterable[Subtask]) -> frozenset[str]:
     return frozenset(found)
 
 
-def fresh_ids(revision: int, used: Iterable[str], count: int) -> list[str]:
-    """Return ids for new subtasks of a revision, none of them used before in this task."""
-    taken = set(used)
+def fresh_ids(record: TaskRecord, count: int) -> list[str]:
+    """Return ids for new subtasks of a task's next revision, none of them used before in this task.
+
+    They differ by coordinator, since the two sides of a partition may both revise a plan: the effects of handlers are
+    known by these ids, and a robot must not take a command of the one for that of the other.
+    """
+    taken = {*(each.subtask.id for each in record.subtasks), *record.retired}
+    digest = hashlib.sha256(record.coordinator.encode()).digest()
+    mark = "".join(chr(ord("a") + byte % 26) for byte in digest[:3])
     found: list[str] = []
     number = 0
     while len(found) < count:
         number += 1
-        name = f"r{revision}_{number}"
+        name = f"r{record.revised + 1}{mark}_{number}"
         if name not in taken:
             found.append(name)
     return found

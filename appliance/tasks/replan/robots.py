@@ -92,7 +92,9 @@ def another_robot(
     again = _to_repeat(done, roots, manifests)
     if len(record.subtasks) + len(again) > MAX_SUBTASKS:
         return f"the plan would have more than {MAX_SUBTASKS} subtasks"
-    wanted = [manifests[each.subtask.skill] for each in (*rest, *again) if each.subtask.skill in manifests]
+    if unknown := [each.subtask.skill for each in (*rest, *again) if each.subtask.skill not in manifests]:
+        return f"what {unknown[0]} needs of a robot is not known here"
+    wanted = [manifests[each.subtask.skill] for each in (*rest, *again)]
     tried = {each.robot for one in rest for each in one.attempts if each.robot and each.failure}
     chosen, reason = _choose(record, label, {old, *tried}, wanted, robots, config)
     if chosen is None:
@@ -184,8 +186,7 @@ def _with_copies(record: TaskRecord, roots: set[str], again: list[Subtask]) -> P
     assert plan is not None  # noqa: S101 - a record with subtasks has the plan they are of
     if not again:
         return plan
-    used = [*(each.subtask.id for each in record.subtasks), *record.retired]
-    names = fresh_ids(record.revised + 1, used, len(again))
+    names = fresh_ids(record, len(again))
     copies: list[Subtask] = []
     for name, each in zip(names, again, strict=True):
         # After what the original came after, and that is done, so that it has the same results to go by.

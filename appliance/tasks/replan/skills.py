@@ -46,9 +46,7 @@ def alternative_skill(
         if problem:
             reasons.append(problem)
             continue
-        (name,) = fresh_ids(
-            record.revised + 1, [*(each.subtask.id for each in record.subtasks), *record.retired], 1
-        )  # fmt: skip
+        (name,) = fresh_ids(record, 1)
         subtask = Subtask(
             id=name,
             skill=choice.skill,

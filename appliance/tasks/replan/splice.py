@@ -29,9 +29,8 @@ class Spliced(Struct, frozen=True, kw_only=True):
 def splice(record: TaskRecord, proposed: Plan) -> Spliced:
     """Return the plan of a task that goes on as proposed."""
     matches = _matches(record, proposed.subtasks)
-    used = [*(each.subtask.id for each in record.subtasks), *record.retired]
     new = [each for each in proposed.subtasks if each.id not in matches]
-    names = {each.id: name for each, name in zip(new, fresh_ids(record.revised + 1, used, len(new)), strict=True)}
+    names = {each.id: name for each, name in zip(new, fresh_ids(record, len(new)), strict=True)}
     names.update({theirs: ours.subtask.id for theirs, ours in matches.items()})
     begun = [each for each in record.subtasks if each.state is SubtaskState.SUCCEEDED or each.state in ACTIVE]
     matched = {each.subtask.id for each in matches.values()}

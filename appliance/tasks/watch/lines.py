@@ -169,11 +169,15 @@ def of_event(event: RunEvent) -> Line | None:
 
 def of_log(gateway: str, line: LogLine) -> Line | None:
     """Return the line of a gateway's log line that is about a task; None for any other."""
-    task = line.fields.get("task")
+    known = dict(line.fields)
+    run = known.get("run")
+    if "task" not in known and isinstance(run, str) and (parts := run.split("/"))[2:] and parts[2].isdecimal():
+        # What pools and executors log names the run: task/subtask/attempt.
+        known |= {"task": parts[0], "subtask": parts[1], "attempt": int(parts[2][:6])}
+    task, attempt, subtask = known.get("task"), known.get("attempt"), known.get("subtask")
     if not isinstance(task, str) or not task:
         return None
-    attempt, subtask = line.fields.get("attempt"), line.fields.get("subtask")
-    rest = {name: value for name, value in line.fields.items() if name not in ("task", "subtask", "attempt", "gateway")}
+    rest = {name: value for name, value in known.items() if name not in ("task", "subtask", "attempt", "gateway")}
     return Line(
         kind=LineKind.GATEWAY,
         task=task,

@@ -104,8 +104,9 @@ class Stream:
                 self._put(None)
 
         def on_log(key: str, line: LogLine | None) -> None:
-            if line is not None and line.fields.get("task") == self._task:
-                self._put(lines.of_log(key.split("/")[-2], line))
+            told = lines.of_log(key.split("/")[-2], line) if line is not None else None
+            if told is not None and told.task == self._task:
+                self._put(told)
 
         def on_notice(_: str, notice: Notice | None) -> None:
             if notice is not None and notice.task == self._task:

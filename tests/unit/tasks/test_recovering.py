@@ -50,7 +50,7 @@ async def test_a_new_plan_keeps_what_is_finished_and_replaces_the_rest(bench: An
     bench.around.recovery.new_plan = OTHERWISE
     await first_done_second_broken(bench)
     _, request = await bench.ordered()
-    assert (request.subtask, request.attempt, request.params) == ("r1_1", 1, {"n": 9})
+    assert (request.subtask, request.attempt, request.params) == ("r1ltn_1", 1, {"n": 9})
     assert request.inputs == {"s1": {"skill": "work", "first": True}}
     bench.tell(request, SUCCEEDED)
     ended = await bench.end()
@@ -92,7 +92,7 @@ async def test_an_unsure_plan_waits_for_an_operator(bench: Any) -> None:
     assert bench.around.orders.empty()
     bench.say(Agreement(agree=True, by="ann"))
     _, request = await bench.ordered()
-    assert request.subtask == "r1_1"
+    assert request.subtask == "r1ltn_1"
 
 
 async def test_an_operator_turns_a_plan_down(bench: Any) -> None:
@@ -128,7 +128,7 @@ async def test_runs_that_the_new_plan_leaves_out_are_ended_first(bench: Any) -> 
     event = replace(last_of(beside), failure=Failure(code="cancelled", message="stopped"))
     bench.driver.tell(RunNews(event))
     _, request = await bench.ordered()
-    assert request.subtask == "r1_1"
+    assert request.subtask == "r1ltn_1"
     bench.tell(request, SUCCEEDED)
     ended = await bench.end()
     assert ended.state is TaskState.SUCCEEDED
@@ -164,7 +164,7 @@ async def test_a_coordinator_that_takes_over_does_not_ask_again(bench: Any) -> N
     await bench.start(bench.stored())
     bench.say(Agreement(agree=True))
     _, request = await bench.ordered()
-    assert request.subtask == "r1_1"
+    assert request.subtask == "r1ogp_1"
     assert len(bench.around.recovery.asked) == 1
 
 

@@ -72,8 +72,8 @@ def test_another_robot_repeats_what_the_rest_builds_on() -> None:
     assert isinstance(found, Rebinding)
     assert found.robot == "rover_2"
     by_id = {each.id: each for each in found.plan.subtasks}
-    assert by_id["r1_1"].params == {"place": "dock 3"}
-    assert set(by_id["s2"].after) == {"s1", "r1_1"}
+    assert by_id["r1ltn_1"].params == {"place": "dock 3"}
+    assert set(by_id["s2"].after) == {"s1", "r1ltn_1"}
     assert by_id["s9"].after == ("s2",)
 
 
@@ -145,11 +145,11 @@ def test_an_alternative_takes_the_place_with_its_parameters_mapped() -> None:
     record = given_up((GOTO, detect, NOTE), "s2", BROKEN)
     found = alternative_skill(record, record.of("s2"), manifests=SKILLS)
     assert isinstance(found, Substitution)
-    assert found.subtask == replace(detect, id="r1_1", skill="find")
-    assert [each.after for each in found.plan.subtasks] == [(), ("s1",), ("r1_1",)]
+    assert found.subtask == replace(detect, id="r1ltn_1", skill="find")
+    assert [each.after for each in found.plan.subtasks] == [(), ("s1",), ("r1ltn_1",)]
     after = step(record, TransitionKind.SUBSTITUTED, subtask="s2", plan=found.plan, note=found.note)
-    assert after.of("r1_1").instead_of == ("detect",)
-    assert after.of("r1_1").state is SubtaskState.READY
+    assert after.of("r1ltn_1").instead_of == ("detect",)
+    assert after.of("r1ltn_1").state is SubtaskState.READY
     assert after.retired == ("s2",)
 
 
@@ -214,10 +214,10 @@ def test_a_new_plan_keeps_what_is_finished_by_what_it_is_not_by_its_id() -> None
     spliced = splice(record, proposed)
     assert [(each.id, each.skill, each.after) for each in spliced.plan.subtasks] == [
         ("s1", "goto", ()),
-        ("r1_1", "record_video", ("s1",)),
-        ("s9", "notify", ("r1_1",)),
+        ("r1ltn_1", "record_video", ("s1",)),
+        ("s9", "notify", ("r1ltn_1",)),
     ]
-    assert (spliced.added, spliced.ending) == (("r1_1",), ())
+    assert (spliced.added, spliced.ending) == (("r1ltn_1",), ())
     record = step(record, TransitionKind.PROPOSED, subtask="s2", plan=proposed)
     record = step(record, TransitionKind.REPLANNED, subtask="s2", plan=spliced.plan)
     assert record.of("s1").result == {"of": "s1"}

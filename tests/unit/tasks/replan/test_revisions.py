@@ -248,7 +248,7 @@ def test_an_id_that_was_taken_out_is_never_given_again() -> None:
     walk.apply(TransitionKind.SUBSTITUTED, subtask="s2", plan=swap.plan)
     back = replace(swap.plan, subtasks=(*swap.plan.subtasks, Subtask(id="s2", skill="see", robot="any")))
     with pytest.raises(StaleTransitionError, match="uses the id s2 again"):
-        walk.apply(TransitionKind.REBOUND, subtask="r1_1", robot="r2", plan=back)
+        walk.apply(TransitionKind.REBOUND, subtask="r1ltn_1", robot="r2", plan=back)
 
 
 def test_nothing_takes_effect_that_was_not_proposed_and_agreed_to() -> None:

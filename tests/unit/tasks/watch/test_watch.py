@@ -60,7 +60,11 @@ def test_log_lines_of_gateways_belong_to_the_task_they_name() -> None:
     found = of_log("gw-2", told)
     assert found is not None
     assert (found.task, found.subtask, found.gateway, found.fields) == ("t", "s1", "gw-2", {"x": 1})
+    of_run = of_log("gw-2", replace(told, fields={"run": "t/s1/2", "reason": "x"}))
+    assert of_run is not None
+    assert (of_run.task, of_run.subtask, of_run.attempt) == ("t", "s1", 2)
     assert of_log("gw-2", replace(told, fields={})) is None
+    assert of_log("gw-2", replace(told, fields={"run": "t/s1/x"})) is None
     assert of_log("gw-2", replace(told, fields={"task": 7})) is None
     assert of_notice(Notice(id="n", to="ann", text="done", task="t")).text == "to ann: done"
 
