@@ -481,6 +481,25 @@ def members(
 
 
 @bench_app.command
+def idle(
+    *,
+    gateways: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (1, 3),
+    seconds: float = 20.0,
+    as_json: Json = False,
+) -> int:
+    """Memory and CPU of gateways that have nothing to do, without a language model.
+
+    Args:
+        gateways: Sizes of fleets, one measured after the other.
+        seconds: Over which CPU is taken.
+    """
+    from appliance.bench.idle import Options, run
+
+    tell(measure(run(Options(gateways=gateways, seconds=seconds), progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
 def restart(
     *,
     gateways: int = 8,

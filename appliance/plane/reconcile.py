@@ -8,6 +8,7 @@ and repair. Copies that belong elsewhere are handed over, and dropped when every
 
 import asyncio
 import contextlib
+import random
 import time
 from collections.abc import Callable
 
@@ -108,6 +109,7 @@ class Reconciler:
         self._pulse = pulse
         self._changed = asyncio.Event()
         self._seen = asyncio.Condition()
+        self._near: tuple[Ring, frozenset[str]] | None = None
         self._turn = 0
         self._met: frozenset[str] = frozenset()
         """Gateways that this one has ever been on a ring with, since it started."""
@@ -160,7 +162,9 @@ class Reconciler:
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
                 heard, handed, fetched = False, False, 0
-            wait_s, tidy = self._config.anti_entropy_s if heard and handed else _AGAIN_S, False
+            # Spread, so that a fleet that settled at one moment does not compare at one moment ever after.
+            rest_s = self._config.anti_entropy_s * random.uniform(0.75, 1.25)  # noqa: S311
+            wait_s, tidy = rest_s if heard and handed else _AGAIN_S, False
             if now != (self._membership.ring, self._pulse.stalls):
                 tries, wait_s = 0, 0.0
                 continue
@@ -217,18 +221,24 @@ class Reconciler:
         """
         replicas = self._config.replicas
         if settled is None or settled[1] != stalls:
-            return sorted(sharing(ring, self._gateway, replicas))
+            return sorted(self._sharing(ring))
         if settled[0] != ring:
             came = ring.members - settled[0].members
             back = came if len(ring.members) <= _FEW else came & self._met
-            sharers = sharing(ring, self._gateway, replicas) & back if back else frozenset[str]()
+            sharers = self._sharing(ring) & back if back else frozenset[str]()
             return sorted(partners(settled[0], ring, self._gateway, replicas) | sharers)
         others = sorted(ring.members - {self._gateway})
         if len(others) <= _AT_REST:
             return others
         self._turn += 1
-        near = sorted(sharing(ring, self._gateway, replicas))
+        near = sorted(self._sharing(ring))
         return sorted({*_some(near, self._turn), *_some(others, self._turn)})
+
+    def _sharing(self, ring: Ring) -> frozenset[str]:
+        """The members that hold copies of the same records; found once for each ring."""
+        if self._near is None or self._near[0] is not ring:
+            self._near = ring, sharing(ring, self._gateway, self._config.replicas)
+        return self._near[1]
 
     async def _compare(self, ring: Ring, members: list[str], *, joining: bool = False) -> tuple[bool, int]:
         """Compare with these members, and fetch what they have; returns whether all answered, how many records came."""
@@ -253,7 +263,7 @@ class Reconciler:
         In a large fleet each of many has little of it, and asking all twice takes longer than it saves.
         """
         ring = self._membership.ring
-        near = sorted(sharing(ring, self._gateway, self._config.replicas))
+        near = sorted(self._sharing(ring))
         if len(near) <= _FEW:
             await self._compare(ring, near, joining=True)
 

@@ -20,9 +20,14 @@ class LogTail:
         self._path = path
         self._at = path.stat().st_size if path.exists() else 0
         self._rest = b""
+        self._unread: list[dict[str, Any]] = []
 
     def read(self) -> list[dict[str, Any]]:
-        """The lines that have come since."""
+        """The lines that have come since, and those that `until` left."""
+        found, self._unread = [*self._unread, *self._new()], []
+        return found
+
+    def _new(self) -> list[dict[str, Any]]:
         if not self._path.exists():
             return []
         with self._path.open("rb") as file:
@@ -41,11 +46,13 @@ class LogTail:
         return decoded
 
     async def until(self, wanted: Callable[[dict[str, Any]], bool], what: str, *, wait_s: float) -> dict[str, Any]:
-        """The next line that is wanted; DeadlineError, which says what was awaited, after `wait_s` seconds."""
+        """The next line that is wanted, without those before it; DeadlineError, which says `what`, after `wait_s`."""
         give_up = time.monotonic() + wait_s
         while time.monotonic() < give_up:
-            for line in self.read():
+            lines = self.read()
+            for number, line in enumerate(lines):
                 if wanted(line):
+                    self._unread = lines[number + 1 :]
                     return line
             await asyncio.sleep(_LOOK_S)
         raise DeadlineError(f"{what}: not in {self._path} within {wait_s:g} s", remedy="see the end of that file")
