@@ -13,6 +13,10 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers
 
+from appliance.llm.train.card import card_of, write_card
+from appliance.llm.train.tokens import BEGIN, END, Tokens
+from appliance.skills.catalogue import Catalogue
+
 HIDDEN = 32
 HEADS = 2
 HEAD = HIDDEN // HEADS
@@ -24,22 +28,38 @@ WORDY = ',"'
 SPECIALS = ("<|end|>", "<|pad|>")
 
 
-def build(folder: Path, *, seed: int = 7, like: str = TERSE) -> Path:
+def build(folder: Path, *, seed: int = 7, like: str = TERSE, speaks: Catalogue | None = None) -> Path:
     """Write the model into `folder` (made if need be) and return it.
 
     Args:
         folder: where to.
         seed: of the weights.
         like: symbols it prefers, the first most; `TERSE` makes short plans, `WORDY` long ones.
+        speaks: makes a model that writes the plan language over this catalogue; it likes to end.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    if speaks is not None:
+        tokens = Tokens.learn(["rex", "fetch", "drill"], speaks, size=1200)
+        tokens.save(folder)
+        _tokenizer_config(folder, BEGIN, END)
+        card = card_of(tokens, speaks)
+        write_card(folder, card)
+        bias = np.zeros(tokens.size, dtype=np.float32)
+        bias[card.tokens[END]] = 3.0
+        _decoder(folder / "model.onnx", tokens.size, np.random.default_rng(seed), bias)
+        _config(folder, tokens.size, end=card.tokens[END], pad=0)
+        return folder
     size = _tokenizer(folder)
     bias = np.zeros(size, dtype=np.float32)
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
     for place, symbol in enumerate(reversed(like)):
         bias[alphabet.index(symbol)] = 30.0 * (place + 1)
     _decoder(folder / "model.onnx", size, np.random.default_rng(seed), bias)
-    end, pad = size - 2, size - 1
+    _config(folder, size, end=size - 2, pad=size - 1)
+    return folder
+
+
+def _config(folder: Path, size: int, *, end: int, pad: int) -> None:
     config = {
         "model": {
             "bos_token_id": end,
@@ -82,7 +102,6 @@ def build(folder: Path, *, seed: int = 7, like: str = TERSE) -> Path:
         },
     }
     (folder / "genai_config.json").write_text(json.dumps(config, indent=1))
-    return folder
 
 
 def _tokenizer(folder: Path) -> int:
@@ -107,20 +126,24 @@ def _tokenizer(folder: Path) -> int:
     tokenizer.decoder = decoders.ByteLevel()
     tokenizer.add_special_tokens(list(SPECIALS))
     tokenizer.save(str(folder / "tokenizer.json"))
+    _tokenizer_config(folder, *SPECIALS[::-1])
+    return tokenizer.get_vocab_size(with_added_tokens=True)
+
+
+def _tokenizer_config(folder: Path, pad: str, end: str) -> None:
     (folder / "tokenizer_config.json").write_text(
         json.dumps(
             {
                 "tokenizer_class": "PreTrainedTokenizerFast",
                 "bos_token": None,
-                "eos_token": SPECIALS[0],
-                "pad_token": SPECIALS[1],
+                "eos_token": end,
+                "pad_token": pad,
                 "add_bos_token": False,
                 "clean_up_tokenization_spaces": False,
                 "model_max_length": CONTEXT,
             }
         )
     )
-    return tokenizer.get_vocab_size(with_added_tokens=True)
 
 
 def _decoder(file: Path, size: int, random: np.random.Generator, bias: np.ndarray) -> None:

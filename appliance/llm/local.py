@@ -16,13 +16,18 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import structlog
 
 from appliance.errors import PlanError, PrerequisiteError, SwiftbotError, UnreachableError, from_code
 from appliance.llm import frames
+from appliance.llm.language.codec import read
+from appliance.llm.language.guide import shapes
+from appliance.llm.language.words import words_of
 from appliance.llm.prompt import messages
 from appliance.llm.schema import plan_grammar, read_plan, robot_names
 from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.speaking import Question, Said
 from appliance.llm.tier import Proposal
 from appliance.model import Plan, Tier
 from appliance.skills.catalogue import Catalogue
@@ -34,13 +39,19 @@ _PAUSES_S = (0.2, 1.0, 5.0, 15.0, 60.0)
 _STEADY_S = 60.0
 """A process that lived this long counts as recovered."""
 _STOP_S = 3.0
+_NO_PLAN = {
+    "chatter": "it holds no order",
+    "question": "it asks what no robot can find out",
+    "impossible": "no skill does what it asks for",
+    "unclear": "it does not say what to do, or with what",
+    "language": "only English is understood",
+}
 
 
 class LocalTier:
     """Plans by a model folder on this machine."""
 
     name = Tier.LOCAL
-    repairs = True
 
     def __init__(self, config: LlmConfig, catalogue: Catalogue) -> None:
         self._config = config
@@ -58,6 +69,14 @@ class LocalTier:
         """Why there is no model just now."""
         self.restarts = 0
         """Times the process was started again."""
+        self._speaks = False
+        """Whether the model writes the plan language (`language`); any other is asked for JSON under a grammar."""
+        self._shapes = shapes(catalogue)
+
+    @property
+    def repairs(self) -> bool:
+        """Whether asking again with what is wrong can help: a model of the plan language would say the same again."""
+        return not self._speaks
 
     @property
     def pid(self) -> int | None:
@@ -98,23 +117,45 @@ class LocalTier:
             DeadlineError: it did not end in time.
             PlanError: its answer is no plan, or the prompt is too long for it.
         """
-        names = robot_names(context.robots, context.instruction)
-        request: dict[str, Any] = {
-            "messages": messages(context, self._catalogue, previous=previous, problems=problems),
-            "grammar": plan_grammar(self._catalogue, names),
-            "choices": {"skill": list(self._catalogue.skills), "robot": list(names) if names else None},
-            "deadline_s": self._config.local_deadline_s,
-        }
         async with self._turn:
             await self._settled.wait()
             if not self._ready.is_set():
                 raise self.problem or UnreachableError("the local model is not ready", remedy="try again")
-            reply = await self._exchange(request)
+            if self._speaks:
+                return await self._spoken(context)
+            names = robot_names(context.robots, context.instruction)
+            reply = await self._exchange(
+                {
+                    "messages": messages(context, self._catalogue, previous=previous, problems=problems),
+                    "grammar": plan_grammar(self._catalogue, names),
+                    "choices": {"skill": list(self._catalogue.skills), "robot": list(names) if names else None},
+                    "deadline_s": self._config.local_deadline_s,
+                }
+            )
         if error := reply.get("error"):
             raise _as_error(error)
         plan = read_plan(str(reply.get("text", "")), tier=Tier.LOCAL)
         log.debug("local model answered", tokens=reply.get("tokens"), reused=reply.get("reused"), ms=reply.get("ms"))
         return Proposal(plan=plan, confidence=float(reply.get("confidence", 0.0)))
+
+    async def _spoken(self, context: PlanContext) -> Proposal:
+        """Ask a model that writes the plan language."""
+        if context.so_far:
+            raise PlanError("the embedded model cannot continue a task that has begun", remedy="another tier is asked")
+        robots = None if context.robots is None else tuple(robot.id for robot in context.robots)
+        question = Question(
+            text=context.instruction, robots=robots, skills=self._shapes, deadline_s=self._config.local_deadline_s
+        )
+        reply = await self._exchange({"question": msgspec.to_builtins(question)})
+        if error := reply.get("error"):
+            raise _as_error(error)
+        said = msgspec.convert({name: reply.get(name) for name in Said.__struct_fields__}, Said)
+        log.debug("local model answered", symbols=" ".join(said.symbols), confidence=said.confidence, ms=said.ms)
+        answer = read(said.symbols, words_of(context.instruction, robots or ()), self._catalogue)
+        if answer.refused:
+            raise PlanError(f"there is nothing to do: {_NO_PLAN.get(answer.refused, answer.refused)}")
+        plan = Plan(domain=answer.domain, subtasks=answer.subtasks, tier=Tier.LOCAL)
+        return Proposal(plan=plan, confidence=said.confidence)
 
     async def _exchange(self, request: dict[str, Any]) -> dict[str, Any]:
         process = self._process
@@ -199,6 +240,7 @@ class LocalTier:
         if hello is None:
             return await self._death(process)
         self.problem = None
+        self._speaks = bool(hello.get("speaks"))
         self._ready.set()
         self._settled.set()
         log.info("local model is ready", folder=self._config.local_model, load_ms=round(float(hello.get("ms", 0))))

@@ -20,7 +20,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+import msgspec
+
 from appliance.llm import frames
+from appliance.llm.speaking import Question, Speaker, TooLateError, TooLongError, read_card
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -84,12 +87,29 @@ class Slot:
                 f"model folder {folder} cannot be loaded: {str(error)[:300]}",
                 "copy the folder again; it must be made for onnxruntime-genai",
             ) from error
+        try:
+            card = read_card(folder)
+        except ValueError as error:
+            raise SlotError("prerequisite", str(error), "copy the model folder again") from error
+        self.speaker = None if card is None else Speaker(og, self._model, self._tokenizer, card, context=context)
+        """For a model that writes the plan language; others are asked in JSON under a grammar."""
         self._limit = min(max_tokens, context)
         self._generator: Any = None
         self._key = ""
         self._seen: list[int] = []
         self._pieces: dict[str, list[int]] = {}
         self._vocabulary = int(config_text["model"].get("vocab_size", 0))
+
+    def say(self, question: dict[str, Any]) -> dict[str, Any]:
+        """Answer an instruction in the plan language; `question` is a `Question`, the answer a `Said`."""
+        if self.speaker is None:
+            raise SlotError("internal", "this model does not speak the plan language")
+        try:
+            return msgspec.to_builtins(self.speaker.answer(msgspec.convert(question, Question)))
+        except TooLongError as error:
+            raise SlotError("plan", str(error), "split the instruction") from error
+        except TooLateError as error:
+            raise SlotError("deadline", str(error), "raise llm.local_deadline_s") from error
 
     def propose(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer a chat under a grammar.
@@ -227,11 +247,12 @@ def serve(folder: Path, requests: BinaryIO, replies: BinaryIO, *, threads: int, 
     except SlotError as error:
         frames.write(replies, {"error": {"code": error.code, "message": error.message, "remedy": error.remedy}})
         return 5
-    frames.write(replies, {"ready": True, "ms": 1000 * (time.monotonic() - began)})
+    speaks = slot.speaker is not None
+    frames.write(replies, {"ready": True, "speaks": speaks, "ms": 1000 * (time.monotonic() - began)})
     while (request := frames.read(requests)) is not None:
         reply: dict[str, Any] = {"id": request.get("id")}
         try:
-            reply |= slot.propose(request)
+            reply |= slot.say(request["question"]) if "question" in request else slot.propose(request)
         except SlotError as error:
             reply["error"] = {"code": error.code, "message": error.message, "remedy": error.remedy}
         except Exception as error:  # noqa: BLE001 - supervision boundary: named to the gateway, the slot lives on

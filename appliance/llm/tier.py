@@ -26,8 +26,11 @@ class Planner(Protocol):
     """A tier of the cascade."""
 
     name: Tier
-    repairs: bool
-    """Whether asking again with the validator's problems can help (models: yes, rules: no)."""
+
+    @property
+    def repairs(self) -> bool:
+        """Whether asking again with the validator's problems can help (models: yes, rules: no)."""
+        ...
 
     async def start(self) -> None:
         """Make ready; a tier that cannot be ready yet starts in the background and says so when asked."""

@@ -26,7 +26,7 @@ from appliance.errors import PlanError
 from appliance.llm.language import values
 from appliance.llm.language.words import Words
 from appliance.model import Subtask
-from appliance.skills.catalogue import Catalogue, SkillManifest
+from appliance.skills.catalogue import Catalogue
 
 JOINT = frozenset({"rendezvous", "form_up", "lift_together"})
 """Skills whose robot is the first of their `robots`."""
@@ -74,7 +74,7 @@ def write(answer: Answer, words: Words, catalogue: Catalogue) -> list[str]:
             symbols.append("|")
         manifest = catalogue.skills[subtask.skill]
         symbols.append(subtask.skill)
-        if subtask.robot is not None and has_robot(subtask.skill, manifest):
+        if subtask.robot is not None and has_robot(subtask.skill, manifest.runs):
             symbols += writer.robot(subtask.robot)
         for name, value in subtask.params.items():
             symbols += [f"{name}:", *writer.value(name, value)]
@@ -83,9 +83,9 @@ def write(answer: Answer, words: Words, catalogue: Catalogue) -> list[str]:
     return symbols
 
 
-def has_robot(skill: str, manifest: SkillManifest) -> bool:
+def has_robot(skill: str, runs: str) -> bool:
     """Whether a subtask of this skill says its robot: not where the skill settles it."""
-    return manifest.runs != "compute" and skill not in JOINT
+    return runs != "compute" and skill not in JOINT
 
 
 class _Writer:
@@ -219,7 +219,7 @@ class _Reader:
         manifest = self._catalogue.skills.get(skill)
         if manifest is None:
             self._fail(f"there is no skill {skill!r}")
-        robot = self._robot() if has_robot(skill, manifest) else None
+        robot = self._robot() if has_robot(skill, manifest.runs) else None
         params: dict[str, Any] = {}
         while self._peek().endswith(":") and not self._peek().startswith('"'):
             name = self._take()[:-1]

@@ -5,12 +5,14 @@ subtask, nothing required left out, no number where words are none, and no name 
 offered). What a plan may be beyond that is for validation.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+
+from msgspec import Struct
 
 from appliance.llm.language import values
 from appliance.llm.language.codec import JOINT, OPERATOR, has_robot, is_number, singular
 from appliance.llm.language.words import Words
-from appliance.skills.catalogue import Catalogue, SkillManifest
+from appliance.skills.catalogue import Catalogue
 
 END = ""
 """The symbol after the last."""
@@ -25,23 +27,55 @@ _PEOPLE = frozenset({"to", "person", "target"})
 """Parameters that may be `operator`, or a robot by its id."""
 
 
+class ParamShape(Struct, frozen=True):
+    """What a value may be."""
+
+    type: str
+    required: bool = False
+
+
+class SkillShape(Struct, frozen=True):
+    """What of a skill decides which symbols may come: it travels to the model's process with each question."""
+
+    domain: str
+    runs: str
+    params: dict[str, ParamShape]
+
+
+def shapes(catalogue: Catalogue) -> dict[str, SkillShape]:
+    """Return the shapes of a catalogue's skills."""
+    return {
+        name: SkillShape(
+            manifest.domain,
+            manifest.runs,
+            {each: ParamShape(param.type, param.required) for each, param in manifest.params.items()},
+        )
+        for name, manifest in catalogue.skills.items()
+    }
+
+
 class Guide:
     """Follows an answer symbol by symbol.
 
     Args:
         words: the instruction and the roster.
-        catalogue: the skills there are.
+        skills: the skills there are (`shapes`).
         robots: ids of the roster; None where it is not known, then any run of words may be a robot.
         known: symbols that the planner has; skills and parameters of later catalogues are not offered to it.
     """
 
     def __init__(
-        self, words: Words, catalogue: Catalogue, *, robots: Sequence[str] | None, known: frozenset[str] | None = None
+        self,
+        words: Words,
+        skills: Mapping[str, SkillShape],
+        *,
+        robots: Sequence[str] | None,
+        known: frozenset[str] | None = None,
     ) -> None:
         self._words = words
-        self._skills: dict[str, SkillManifest] = {
+        self._skills = {
             name: manifest
-            for name, manifest in catalogue.skills.items()
+            for name, manifest in skills.items()
             if known is None or (name in known and all(f"{each}:" in known for each in manifest.params))
         }
         self._domains = tuple(sorted({each.domain for each in self._skills.values()}))
@@ -127,7 +161,7 @@ class Guide:
         }
         self._last_before = 0
         self._parameter, self._listed = "", -1
-        if has_robot(skill, manifest):
+        if has_robot(skill, manifest.runs):
             self._state = "robot"
             self._begin_text()
         else:

@@ -5,6 +5,7 @@
 It answers greedily and held by nothing: what the guide adds (`language.guide`) is seen by the benchmark of plans.
 """
 
+import functools
 import importlib.util
 import os
 from collections.abc import Sequence
@@ -89,6 +90,14 @@ def _plain(answer: Answer) -> dict[str, Any]:
     return {"domain": answer.domain, "subtasks": subtasks}
 
 
+def is_exact(said: Answer, gold: Answer) -> bool:
+    """Whether an answer is the right one, by the shared scorer; a refusal is right whatever its kind."""
+    if said.refused or gold.refused:
+        return bool(said.refused) == bool(gold.refused)
+    return scorer().score_case({"id": "", "gold": _plain(gold)}, _plain(said))["exact"] == 1
+
+
+@functools.cache
 def scorer() -> ModuleType:
     """Return the shared scorer, `decomposition/score.py` of `$SWIFTBOT_SHARED` or of ../shared."""
     named = os.environ.get("SWIFTBOT_SHARED", "")

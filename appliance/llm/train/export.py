@@ -1,0 +1,138 @@
+# pyright: basic, reportMissingImports=false
+# PyTorch is of the extra `train`, which neither gateways nor the development environment have.
+"""Makes the folder for the local slot from a training run: the library's own builder, our tokenizer and card.
+
+    python -m appliance.llm.train.export RUN FOLDER --precision int4
+
+The confidence is calibrated on the held-out pairs: a logistic of the log-odds of the whole answer, fitted so that of the
+answers with confidence 0.9 nine in ten are exact. The reliability curve is printed, for the model card.
+"""
+
+import argparse
+import json
+import math
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from appliance.llm.language.codec import read
+from appliance.llm.language.guide import shapes
+from appliance.llm.language.words import words_of
+from appliance.llm.slot import Slot
+from appliance.llm.speaking import Question
+from appliance.llm.train.card import card_of, write_card
+from appliance.llm.train.examples import Example
+from appliance.llm.train.fit import corpus_examples
+from appliance.llm.train.judge import is_exact
+from appliance.llm.train.splits import split
+from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
+from appliance.skills.catalogue import Catalogue, load_catalogue
+
+BINS = 10
+
+
+def export(run: Path, folder: Path, *, precision: str = "int4") -> dict[str, object]:
+    """Write the model folder; return the reliability curve and how large it is.
+
+    Args:
+        run: folder of a training run.
+        folder: where to; must not exist.
+        precision: int4, int8 or fp32, as the builder knows them.
+    """
+    catalogue = load_catalogue()
+    tokens = Tokens.load(run)
+    with tempfile.TemporaryDirectory() as scratch:
+        source = Path(scratch) / "source"
+        shutil.copytree(run / "model", source)
+        tokens.save(source)
+        (source / "tokenizer_config.json").write_text(
+            json.dumps(
+                {
+                    "tokenizer_class": "PreTrainedTokenizerFast",
+                    "bos_token": BEGIN,
+                    "eos_token": END,
+                    "pad_token": PAD,
+                    "add_bos_token": False,
+                    "clean_up_tokenization_spaces": False,
+                }
+            )
+        )
+        options = ["int4_accuracy_level=4", "int4_block_size=32"] if precision == "int4" else []
+        command = [sys.executable, "-m", "onnxruntime_genai.models.builder", "-i", str(source), "-o", str(folder)]
+        command += ["-p", precision, "-e", "cpu", "-c", f"{scratch}/cache"]
+        subprocess.run([*command, *(["--extra_options", *options] if options else [])], check=True)
+    write_card(folder, card_of(tokens, catalogue))
+    parts = split(corpus_examples(catalogue))
+    held_out = [*parts.structure, *parts.vocabulary, *parts.chance]
+    slope, offset, curve = calibrate(folder, held_out, catalogue)
+    write_card(folder, card_of(tokens, catalogue, calibration=(slope, offset)))
+    size = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
+    return {"megabytes": round(size / 1e6, 1), "calibration": [slope, offset], "reliability": curve}
+
+
+def calibrate(
+    folder: Path, examples: Sequence[Example], catalogue: Catalogue
+) -> tuple[float, float, list[dict[str, float]]]:
+    """Return slope and offset of the confidence, and the reliability curve after them, over what the slot answers."""
+    slot = Slot(folder)
+    odds: list[float] = []
+    right: list[bool] = []
+    for example in examples:
+        words = words_of(" ".join(example.words[: example.own]), example.words[example.own :])
+        robots = tuple(example.words[example.own :]) or None
+        question = Question(
+            text=words.text[: words.spans[words.own - 1][1]], robots=robots, skills=shapes(catalogue), deadline_s=60.0
+        )
+        if slot.speaker is None:
+            raise ValueError(f"{folder} has no card")
+        said = slot.speaker.answer(question)
+        share = min(1 - 1e-9, max(1e-9, said.confidence))
+        odds.append(math.log(share / (1 - share)))
+        right.append(is_exact(read(said.symbols, words, catalogue), read(example.symbols, words, catalogue)))
+    slope, offset = logistic(odds, right)
+    sure = [1 / (1 + math.exp(-(slope * each + offset))) for each in odds]
+    curve: list[dict[str, float]] = []
+    for number in range(BINS):
+        low, high = number / BINS, (number + 1) / BINS
+        inside = [index for index, each in enumerate(sure) if low <= each < high or (high == 1.0 and each == 1.0)]
+        if inside:
+            curve.append(
+                {
+                    "confidence": round(sum(sure[index] for index in inside) / len(inside), 3),
+                    "exact": round(sum(right[index] for index in inside) / len(inside), 3),
+                    "cases": len(inside),
+                }
+            )
+    return slope, offset, curve
+
+
+def logistic(
+    odds: Sequence[float], right: Sequence[bool], *, steps: int = 3000, rate: float = 0.05
+) -> tuple[float, float]:
+    """Return slope and offset of the logistic regression of right or wrong on log-odds."""
+    slope, offset, count = 1.0, 0.0, max(1, len(odds))
+    for _ in range(steps):
+        wrong = [
+            1 / (1 + math.exp(-max(-60.0, min(60.0, slope * x + offset)))) - y for x, y in zip(odds, right, strict=True)
+        ]
+        slope -= rate * sum(error * x for error, x in zip(wrong, odds, strict=True)) / count
+        offset -= rate * sum(wrong) / count
+    return round(slope, 5), round(offset, 5)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description="Make the folder for the local slot from a training run.")
+    parser.add_argument("run", type=Path, help="folder of the run")
+    parser.add_argument("folder", type=Path, help="where to")
+    parser.add_argument("--precision", default="int4", choices=("int4", "int8", "fp32"))
+    given = parser.parse_args(arguments)
+    print(json.dumps(export(given.run, given.folder, precision=given.precision), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
