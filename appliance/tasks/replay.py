@@ -46,6 +46,10 @@ class ReplayReport(Struct, frozen=True, kw_only=True):
     same: bool = False
 
 
+_TAKES_OVER = (TransitionKind.ADOPTED, TransitionKind.HEALED)
+"""What a coordinator may begin with where another has been: a task that has ended is only healed."""
+
+
 class _Folding:
     """One task while the log is read."""
 
@@ -60,6 +64,10 @@ class _Folding:
     def take(self, event: Transition) -> None:
         self.transitions += 1
         base = self.record
+        if base is not None and event.coordinator != base.coordinator and event.kind not in _TAKES_OVER:
+            # Of the other side of a partition, or of one that was succeeded and does not know it yet.
+            self.stale += 1
+            return
         if event.kind is TransitionKind.ADOPTED and base is not None:
             # The new coordinator goes on from the last *written* record; progress since then is not in it.
             base = self.history.get(event.sequence - 1, base)

@@ -2,13 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 from mcap.writer import Writer
+from msgspec.structs import replace
 
 from appliance.errors import RecordError
-from appliance.model import Failure, Plan, Subtask, TaskRecord, TaskState
+from appliance.model import Failure, Plan, Split, Subtask, TaskRecord, TaskState
 from appliance.tasks import machine
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.replay import replay
@@ -125,3 +127,35 @@ def test_unreadable_payloads_are_counted(tmp_path: Path) -> None:
     report = replay(path)
     assert report.unreadable == 1
     assert report.same
+
+
+def test_a_log_of_both_sides_of_a_partition_replays_to_the_version_that_stands(tmp_path: Path) -> None:
+    """What the side that lost went on telling is left out; the other's move, adoption and healing are folded."""
+    common, _ = history(*STEPS[:4])
+    gw2 = {"coordinator": "gw-2"}
+
+    def step(kind: TransitionKind, sequence: int, **fields: object) -> Transition:
+        named: dict[str, Any] = {"task": "t-1", "sequence": sequence, "kind": kind, "at_ns": 1, "coordinator": "gw-1"}
+        return Transition(**(named | fields))
+
+    split = Split(coordinator="gw-1", sequence=6, state=TaskState.RUNNING, settled=True)
+    mine = [
+        step(TransitionKind.MOVED, 5, subtask="s1", attempt=1, gateway="gw-3", note="moved", **gw2),
+        step(TransitionKind.HEALED, 6, splits=(split,), fences={"s1": 4}, **gw2),
+        step(TransitionKind.SUCCEEDED, 7, subtask="s1", attempt=2, gateway="gw-3", result={"place": "x"}, **gw2),
+    ]
+    adopted = [step(TransitionKind.ADOPTED, 5, **gw2), *(replace(each, sequence=each.sequence + 1) for each in mine)]
+    failure = Failure(code="unreachable", message="x")
+    lost = [
+        step(TransitionKind.PROGRESS, 5, subtask="s1", attempt=1, progress=0.5),
+        step(TransitionKind.ATTEMPT_FAILED, 6, subtask="s1", attempt=1, failure=failure),
+    ]
+    record: TaskRecord | None = None
+    for each in (*common, *adopted):
+        record = machine.apply(record, each)
+    assert record is not None
+    assert record.subtasks[0].attempts[0].left == "moved"
+    log = [*common, adopted[0], lost[0], *adopted[1:3], lost[1], *adopted[3:]]
+    (outcome,) = replay(write(tmp_path / "x.mcap", log, record)).tasks
+    assert outcome.same, outcome.differences
+    assert outcome.stale == 2
