@@ -3,8 +3,7 @@
 Owners put facts when they change (`speaker`). Whoever comes later asks: each member of a small fleet; in a large one a
 neighbour for all that it knows, and then only those it knew nothing of. A fact carries its age: since it was heard, on
 this machine's monotonic clock, and what its speaker said it was old by then; what is older than its speaker promised is
-stale, counts less in decisions, and is asked for again. What a gateway said goes with it; a robot whose token goes is
-shown offline for a while and then forgotten.
+stale, counts less in decisions, and is asked for again. What a gateway said goes with it. Robots are the `roster`'s.
 """
 
 import asyncio
@@ -15,12 +14,13 @@ import time
 from collections.abc import Callable, Iterable
 
 import structlog
-from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
+from appliance.plane.facts import Facts, FactsAsk, Known
 from appliance.plane.membership import Membership
+from appliance.plane.roster import Roster
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
@@ -28,18 +28,14 @@ from appliance.plane.speaker import STATUS_S, Speaker
 
 log = structlog.get_logger(__name__)
 
-ROBOT_KEPT_S = 300.0
-"""How long a robot that went offline is still shown."""
-MOST_ROBOTS = 10_000
 MOST_CONTAINERS = 4096
-"""Bounds on what is believed: robots in a fleet, containers of one gateway."""
+"""Bound on what is believed of one gateway."""
 FEW = 8
 """Members that are each asked at once; with more the newcomer asks one for all, and the others wait for it to speak."""
 LATE = 1.5
 """A status is overdue after so many of the intervals that its speaker promised."""
 _FACTS_S = 2.0
 _FACTS_TRIES = 3
-_TICK_S = 5.0
 _GATHER_S = 0.02
 """For so long a newcomer gathers members before it asks for their facts."""
 _SPEAK_S = 0.2
@@ -50,34 +46,6 @@ _DOUBT_S = 1.0
 """A gateway whose facts are stale is asked again at most so often."""
 
 
-class FactsAsk(Struct, frozen=True, omit_defaults=True):
-    """`facts`: what do you know? `all`: of the other gateways too, of those whose ids come after `after`."""
-
-    all: bool = False
-    after: str = ""
-
-
-class Known(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a gateway knows of another, and how old that is."""
-
-    gateway: str
-    status: GatewayStatus | None = None
-    containers: tuple[ContainerInfo, ...] = ()
-    age_ms: int = 0
-
-
-class Facts(Struct, frozen=True, omit_defaults=True):
-    """A gateway's own facts, the robots it knows of, and, if asked, what it knows of other gateways."""
-
-    gateway: str
-    status: GatewayStatus | None = None
-    containers: tuple[ContainerInfo, ...] = ()
-    robots: tuple[RobotInfo, ...] = ()
-    others: tuple[Known, ...] = ()
-    more: bool = False
-    """There are further others."""
-
-
 class Registry:
     """What is known of the fleet just now. `on_change` gets `gateway`, `container` or `robot`."""
 
@@ -86,7 +54,8 @@ class Registry:
     ) -> None:
         self.gateways: dict[str, GatewayStatus] = {}
         self.containers: dict[str, dict[str, ContainerInfo]] = {}
-        self.robots: dict[str, RobotInfo] = {}
+        self._roster = Roster(session, on_change=lambda: self._tell("robot"))
+        self.robots: dict[str, RobotInfo] = self._roster.robots
         self.on_change: list[Callable[[str], None]] = []
         self._session = session
         self._rpc = rpc
@@ -107,8 +76,6 @@ class Registry:
         """What those gateways that decide anything say is asked for."""
         self._doubted: dict[str, float] = {}
         self._speaker: Speaker | None = None
-        self._gone: dict[str, float] = {}
-        self._sweeping: asyncio.Task[None] | None = None
         if gateway is not None:
             rpc.register("facts", FactsAsk, self._on_facts, exchange=False)
             self._speaker = Speaker(
@@ -121,16 +88,12 @@ class Registry:
     def start(self) -> None:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
-        self._closers = [
-            session.subscribe_typed(keys.robot(), RobotInfo, self._on_robot),
-            session.watch_alive(keys.robot_alive(), self._on_robot_alive),
-        ]
+        self._roster.start()
         if not self._bounded:
-            self._closers += [
+            self._closers = [
                 session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
                 session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
             ]
-        self._sweeping = asyncio.create_task(self._keep_sweeping(), name="registry")
 
     # --- our own facts ----------------------------------------------------------------------------------------
 
@@ -324,7 +287,7 @@ class Registry:
                 while True:
                     ask = FactsAsk(all=True, after=after)
                     facts = await self._rpc.call(neighbour, "facts", ask, Facts, timeout_s=_FACTS_S)
-                    self._take_robots(facts)
+                    self._roster.take(facts.robots)
                     if not after and self._is_member(neighbour):
                         self._take(neighbour, facts)
                     self._take_others(facts.others)
@@ -364,7 +327,7 @@ class Registry:
                 continue
             if not self._is_member(gateway):
                 return
-            self._take_robots(facts)
+            self._roster.take(facts.robots)
             # What was put while the answer was on its way is newer than the answer: ask again.
             if self._heard.get(gateway, 0) == heard or attempt == _FACTS_TRIES - 1:
                 self._take(gateway, facts)
@@ -386,14 +349,6 @@ class Registry:
         }
         self._tell("container")
 
-    def _take_robots(self, facts: Facts) -> None:
-        for robot in facts.robots:
-            if robot.id not in self.robots and len(self.robots) < MOST_ROBOTS:
-                self.robots[robot.id] = robot
-                if not robot.online:
-                    self._gone[robot.id] = time.monotonic()
-                self._tell("robot")
-
     def _drop_ages(self, gateway: str) -> None:
         for container in self.containers.get(gateway, {}):
             self._container_as_of.pop((gateway, container), None)
@@ -413,48 +368,6 @@ class Registry:
         if self.containers.pop(gateway, None) is not None:
             self._tell("container")
 
-    # --- robots -----------------------------------------------------------------------------------------------
-
-    def _on_robot(self, key: str, info: RobotInfo | None) -> None:
-        robot = key.split("/")[-2]
-        if info is None:
-            self._lose(robot)
-            return
-        if info.id != robot:
-            self._session.refuse("misplaced robot/*/state", key=key, says=info.id)
-            return
-        if robot not in self.robots and len(self.robots) >= MOST_ROBOTS:
-            self._session.refuse("too many robot/*/state", key=key)
-            return
-        before = self.robots.get(robot)
-        self.robots[robot] = info
-        if info.online:
-            self._gone.pop(robot, None)
-        else:
-            self._gone.setdefault(robot, time.monotonic())
-        if before != info:
-            self._tell("robot")
-
-    def _on_robot_alive(self, key: str, alive: bool) -> None:
-        if not alive:
-            self._lose(key.split("/")[-2])
-
-    def _lose(self, robot: str) -> None:
-        info = self.robots.get(robot)
-        if info is not None and info.online:
-            self.robots[robot] = replace(info, online=False)
-            self._gone[robot] = time.monotonic()
-            self._tell("robot")
-
-    async def _keep_sweeping(self) -> None:
-        while True:
-            await asyncio.sleep(_TICK_S)
-            before = time.monotonic() - ROBOT_KEPT_S
-            for robot in [each for each, since in self._gone.items() if since < before]:
-                del self._gone[robot]
-                self.robots.pop(robot, None)
-                self._tell("robot")
-
     def _tell(self, kind: str) -> None:
         for callback in tuple(self.on_change):
             try:
@@ -468,8 +381,8 @@ class Registry:
             self._speaker.close()
         for closer in (*self._closers, *(each for both in self._of_member.values() for each in both)):
             closer.close()
-        waited = (self._sweeping, self._catching_up, *self._asking.values())
-        tasks = [each for each in waited if each is not None]
+        await self._roster.close()
+        tasks = [each for each in (self._catching_up, *self._asking.values()) if each is not None]
         for task in tasks:
             task.cancel()
         with contextlib.suppress(asyncio.CancelledError):

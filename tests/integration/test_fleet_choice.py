@@ -36,7 +36,7 @@ from appliance.model import (
     Way,
 )
 from appliance.plane.dht import Found, KeyAsk
-from appliance.plane.registry import Facts, FactsAsk
+from appliance.plane.facts import Facts, FactsAsk
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.checkpoints import checkpoint_key
