@@ -311,7 +311,7 @@ class Gateway:
 
     def _on_robot_task(self, robot: str, request: TaskRequest) -> None:
         """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""
-        if self.plane.ring.owner(f"robot/{robot}") != self.config.id:
+        if not self.plane.dht.owns(f"robot/{robot}"):
             return
         if len(self._handing_in) >= MOST_HANDED_IN:
             self._refuse_intake(robot, f"{MOST_HANDED_IN} tasks of robots are being handed in")

@@ -203,6 +203,15 @@ class Plane:
         """The ring of the gateways that are there just now."""
         return self._membership.ring
 
+    async def owner_of(self, key: str) -> str:
+        """The gateway that a key belongs to: at once where the ring is known whole, else found by asking one's way.
+
+        Raises:
+            UnreachableError: nobody knows just now.
+        """
+        (owner,) = await self._membership.holders(key, 1)
+        return owner
+
     def members(self) -> frozenset[str]:
         """Ids of the gateways that are there, this one among them."""
         return self._membership.members

@@ -40,7 +40,7 @@ class Agreeing:
         if ask.id in self._drivers:
             return await self.agree_here(ask)
         _checked(await self._task(TaskAsk(id=ask.id)))
-        owner = self._plane.ring.owner(task_key(ask.id))
+        owner = await self._plane.owner_of(task_key(ask.id))
         if owner == self._plane.gateway:
             return await self.agree_here(ask)
         return await self._plane.rpc.call(owner, "agree_here", ask, TaskRecord)

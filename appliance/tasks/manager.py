@@ -196,17 +196,19 @@ class TaskManager:
         request = self._check(request)
         until = time.monotonic() + 5.0
         while True:
-            owner = self.plane.ring.owner(task_key(request.id))
-            if owner == self.plane.gateway:
-                return await self.accept(request)
+            owner = ""
             try:
-                return await self.plane.rpc.call(owner, "accept", request, TaskRecord, timeout_s=2.0)
+                owner = await self.plane.owner_of(task_key(request.id))
+                if owner != self.plane.gateway:
+                    return await self.plane.rpc.call(owner, "accept", request, TaskRecord, timeout_s=2.0)
             except (UnreachableError, DeadlineError) as error:
                 # The owner died: its tokens go within a second, then the ring names its successor.
                 if time.monotonic() > until:
                     raise
-                log.info("owner did not answer, asking again", owner=owner, reason=str(error))
+                log.info("owner not found or does not answer, asking again", owner=owner, reason=str(error))
                 await asyncio.sleep(0.1)
+                continue
+            return await self.accept(request)
 
     def _check(self, request: TaskRequest) -> TaskRequest:
         return checked(request, self.config)
@@ -494,7 +496,7 @@ class TaskManager:
         record = await self.task(ask)
         if record.state.final:
             return record
-        owner = self.plane.ring.owner(task_key(ask.id))
+        owner = await self.plane.owner_of(task_key(ask.id))
         if owner == self.plane.gateway:
             self._sweep.set()
             return await self.cancel_here(ask)

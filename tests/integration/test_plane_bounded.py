@@ -72,6 +72,7 @@ async def test_records_are_found_through_bounded_views(tmp_path: Path, free_port
             versions[key] = await planes[names[number % COUNT]].dht.write(key, b"1", expected=None)
             owner, *others = ring.successors(key, 3)
             assert set(versions[key]) == {owner}
+            assert await planes[names[(number + 3) % COUNT]].owner_of(key) == owner
             for holder in (owner, *others):
                 assert await planes[holder].store.record(key) is not None
             read = await planes[names[(number + 7) % COUNT]].dht.read(key)

@@ -136,7 +136,7 @@ class Moving:
             CancelledByOperatorError: it was called off.
             UnreachableError, DeadlineError: its coordinator or its gateway does not answer; the run goes on.
         """
-        owner = self._plane.ring.owner(task_key(check_name(ask.task, "task")))
+        owner = await self._plane.owner_of(task_key(check_name(ask.task, "task")))
         if owner == self._plane.gateway:
             return await self.migrate_here(ask)
         return await self._plane.rpc.call(owner, "migrate_here", ask, Migrated, timeout_s=MOVE_S)
@@ -166,7 +166,7 @@ class Moving:
 
     async def cancel(self, ask: MoveAsk) -> MoveCancelled:
         """Call a move off, wherever it is carried out; False when there is none, or its record is written."""
-        owner = self._plane.ring.owner(task_key(check_name(ask.task, "task")))
+        owner = await self._plane.owner_of(task_key(check_name(ask.task, "task")))
         if owner != self._plane.gateway:
             return await self._plane.rpc.call(owner, "migrate_cancel", ask, MoveCancelled)
         move = self._moves.get((ask.task, ask.subtask))

@@ -264,6 +264,10 @@ class FakePlane:
         self.present = {"gw-1", "gw-2", "gw-3"}
         self.on_member_lost: list[Callable[[str], None]] = []
 
+    async def owner_of(self, key: str) -> str:
+        """Return the one owner."""
+        return self.ring.owner(key)
+
     def members(self) -> frozenset[str]:
         """Return who is there."""
         return frozenset(self.present)
