@@ -108,9 +108,11 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
         try:
             await arena.start_all(progress=progress, ready=1)
             async with await arena.client() as client:
-                for how, rounds in (("kill", options.kills), ("freeze", options.freezes)):
-                    if rounds:
-                        result[how] = await _Rounds(options, arena, client, progress).run(how, rounds)
+                rounds = _Rounds(options, arena, client, progress)
+                if options.kills:
+                    result["kill"] = await rounds.run("kill", options.kills)
+                if options.freezes:
+                    result["freeze"] = await rounds.run("freeze", options.freezes)
         finally:
             await arena.stop(progress=progress)
     return result
