@@ -61,6 +61,35 @@ def run(ctx):
             ctx.checkpoint({"lines": len(lines)})
     return {"lines": lines, "found": first}
 """
+ROUNDS = """
+from _lib import moves
+
+def run(ctx):
+    for lap in range(int(ctx.params["laps"])):
+        here = moves.state(ctx)
+        to = {"x": round(here.x + (0.6 if lap % 2 else -0.6), 2), "y": round(here.y, 2)}
+        ctx.command("goto", timeout_s=60, waypoints=[to], speed_mps=1.5)
+        ctx.progress((lap + 1) / int(ctx.params["laps"]), f"lap {lap + 1}")
+    return {"laps": lap + 1, "attempt": ctx.attempt}
+"""
+ROUNDS_MANIFEST = """
+id = "go_round"
+domain = "navigation"
+summary = "Drives to and fro, for tests of moves."
+runs = "robot"
+uses = ["base"]
+image = "base"
+cpu = 0.1
+memory_mb = 64
+timeout_s = 300
+retries = 0
+verbs = ["goto", "state"]
+moves = "between commands"
+
+[params.laps]
+type = "integer"
+required = true
+"""
 MANIFEST = """
 id = "{name}"
 domain = "coordination"
@@ -102,21 +131,25 @@ def write_skills(folder: Path) -> Path:
         skill.mkdir(parents=True)
         (skill / "handler.py").write_text(textwrap.dedent(handler))
         (skill / "skill.toml").write_text(MANIFEST.format(name=name, more=more))
+    rounds = folder / "skills" / "go_round"
+    rounds.mkdir()
+    (rounds / "handler.py").write_text(ROUNDS)
+    (rounds / "skill.toml").write_text(ROUNDS_MANIFEST)
     return folder / "skills"
 
 
 @asynccontextmanager
 async def fleet_of(
     folder: Path, *, gateways: int = 3, pool: PoolConfig | None = None, migration: MigrationConfig | None = None,
-    pools: dict[str, PoolConfig] | None = None, drain_s: float = 20.0,
+    pools: dict[str, PoolConfig] | None = None, drain_s: float = 20.0, rovers: int = 0,
 ) -> AsyncIterator[FleetState]:  # fmt: skip
-    """A fleet without robots that knows these skills; ended and cleaned up afterwards."""
+    """A fleet that knows these skills, with so many rovers; ended and cleaned up afterwards."""
     order = Order(
         fleet=f"m{os.getpid()}-{time.monotonic_ns() % 100000}",
         directory=folder / "fleet",
         gateways=gateways,
         mavlink=0,
-        zenoh=0,
+        zenoh=rovers,
         pool=pool or PoolConfig(floor={"base": 1}),
         pools=pools or {},
         base=GatewayConfig(

@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from appliance.bench import actors, federated, pooled, rate, refill, soak, startup, transfer, zygote
+from appliance.bench import actors, federated, migrate, pooled, rate, refill, soak, startup, transfer, zygote
 from appliance.pool.engine import PodmanEngine
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
@@ -168,3 +168,15 @@ async def test_transfer(built: None) -> None:
     result = await transfer.run(1, 1, progress=lambda _: None)
     assert all(result[f"{way}_ms"] > 0 for way in ("first", "again", "podman"))
     assert 0 < result["wire_share"] <= 1.5
+
+
+@pytest.mark.fleet
+async def test_migrate(built: None) -> None:
+    """Moves with checkpoints and with a volume, each step's time, and the alternative; all of them start there."""
+    result = await migrate.run(2, 1, 1, 1, overload=False, progress=lambda _: None)
+    for name in ("move, checkpoint 1 kB", "move, checkpoint 256 kB"):
+        assert result[name]["took"]["count"] == 2
+        assert result[name]["took"]["p99"] is not None, result
+        assert {"step find", "step hold", "step write", "step start"} <= set(result[name])
+    assert result["move, volume 1 MB"]["took"]["max"] is not None, result
+    assert result["end, start anew cold"]["count"] == 1

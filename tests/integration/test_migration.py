@@ -5,15 +5,17 @@ import json
 import os
 import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
+import msgspec
 import pytest
 from moving_bench import counting, ended, fleet_of, further_gateway, pretty, until_running
 
 from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, RefusedError
-from appliance.model import TaskState
+from appliance.model import Plan, RobotCommand, Subtask, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig, PressureConfig
 from appliance.record.reader import read
 from appliance.tasks.migration.api import MigrateAsk, MigrationRequest
@@ -142,6 +144,40 @@ async def test_a_target_that_dies_costs_no_retry_and_no_step(tmp_path: Path) -> 
         assert last.state is TaskState.SUCCEEDED, last.failure
         result = last.of("s1").result or {}
         assert result["by"] == sorted(set(result["by"])), result
+
+
+async def test_a_run_that_commands_a_robot_moves_between_commands_and_repeats_none(tmp_path: Path) -> None:
+    """Moved again and again in mid-drive: it waits for the command's end, and the robot does each command once."""
+    async with fleet_of(tmp_path, rovers=1) as state, FleetClient(state.endpoint) as client:
+        plan = Plan(
+            domain="navigation", subtasks=(Subtask(id="s1", skill="go_round", robot="rover_1", params={"laps": 24}),)
+        )
+        await client.submit(TaskRequest(instruction="go round", id="t-round", plan=plan))
+        await until_running(client, "t-round")
+        moves, refusals = 0, list[str]()
+        async with asyncio.timeout(120):
+            while moves < 3:
+                try:
+                    moves += (await client.migrate(MigrateAsk(task="t-round", subtask="s1"))).started
+                except RefusedError as error:
+                    refusals.append(error.message)
+                await asyncio.sleep(0.5)
+        assert all("robot command" in each for each in refusals), refusals
+        last = await ended(client, "t-round")
+        assert last.state is TaskState.SUCCEEDED, last.failure
+        found = last.of("s1")
+        assert (found.result or {})["laps"] == 24
+        assert sum(bool(each.left) for each in found.attempts) == 3, pretty(found)
+        assert not any(each.failure for each in found.attempts), pretty(found)
+    done = Counter(
+        command.id
+        for message in read(max(Path(state.record_dir).glob("*.mcap")))
+        if message.key.endswith("/commanded")
+        and (command := msgspec.json.decode(message.payload, type=RobotCommand)).task == "t-round"
+        and command.verb == "goto"
+    )
+    assert len(done) == 24, done
+    assert set(done.values()) == {1}, done
 
 
 async def test_a_gateway_short_of_memory_gives_running_work_away(tmp_path: Path) -> None:
