@@ -62,9 +62,8 @@ def revision_lines(record: TaskRecord) -> Iterator[Text]:
         waits = f": `swiftbot task agree {record.id}` or `--no`" if record.proposal.waits else ""
         yield Text(f"  proposed: {record.proposal.note}{waits}", style="bold yellow")
         for each in record.proposal.plan.subtasks:
-            yield Text(
-                f"    {each.id} {each.skill} {each.robot or '–'} {each.params} after {', '.join(each.after) or '–'}"
-            )
+            after = f" after {', '.join(each.after)}" if each.after else ""
+            yield Text(f"    {each.id} {each.skill} {each.robot or '–'} {each.params}{after}")
     for each in record.subtasks:
         if each.condition:
             yield Text(f"  {each.subtask.id} is {each.condition}: {each.note}", style="yellow")

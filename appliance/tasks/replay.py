@@ -141,6 +141,8 @@ def compare(logged: TaskRecord, replayed: TaskRecord) -> tuple[str, ...]:
     found: list[str] = []
     if logged.state is not replayed.state:
         found.append(f"task: logged {logged.state}, replayed {replayed.state}")
+    if logged.revised != replayed.revised:
+        found.append(f"task: logged {logged.revised} revisions of its plan, replayed {replayed.revised}")
     ids = [each.subtask.id for each in logged.subtasks]
     if ids != [each.subtask.id for each in replayed.subtasks]:
         return (*found, "the subtasks are not the same")

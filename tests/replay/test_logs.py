@@ -1,8 +1,9 @@
 """Recorded logs as regression tests: today's state machine must give the end states that were logged then.
 
 `logs/` holds MCAP files that real fleets recorded: the demonstration, a coordinator and an executing gateway that
-were killed in mid-task, a cancelled task, instructions without a valid plan. To add one, copy a file from a
-fleet's `record` folder and name its end states here.
+were killed in mid-task, a cancelled task, instructions without a valid plan, and work that went wrong: a stuck run, an
+alternative skill, new plans that an operator agreed to and turned down. To add one, copy a file from a fleet's `record`
+folder and name its end states here.
 """
 
 from collections import Counter
@@ -22,6 +23,7 @@ STATES = {
     "executor-killed.mcap": ["succeeded"],
     "cancelled.mcap": ["cancelled"],
     "no-plan.mcap": ["failed", "failed", "succeeded"],
+    "replanned.mcap": ["failed", "succeeded", "succeeded"],
 }
 
 
@@ -51,6 +53,17 @@ def test_a_lost_gateway_shows_in_the_log_and_doubles_nothing(name: str) -> None:
     assert transitions["adopted"] or transitions["attempt failed"]
     assert commands
     assert set(commands.values()) == {1}
+
+
+def test_revisions_are_in_the_log_as_transitions_of_their_own() -> None:
+    """What was found, proposed, agreed to and done about it, by its kind."""
+    kinds: Counter[str] = Counter()
+    for message in read(LOGS / "replanned.mcap"):
+        if message.key.endswith("/transition"):
+            kinds[msgspec.json.decode(message.payload)["kind"]] += 1
+    expected = {"substituted": 1, "proposed": 2, "agreed": 1, "replanned": 1, "replan failed": 1}
+    assert {kind: kinds[kind] for kind in expected} == expected
+    assert kinds["noticed"] >= 1
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.6, 0.9, 0.99])
