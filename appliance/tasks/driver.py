@@ -30,6 +30,7 @@ from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
 from appliance.tasks.planning import plan_it
 from appliance.tasks.replanning import Replanning
+from appliance.tasks.soundness import Unknown
 from appliance.tasks.surroundings import (
     Agreement,
     CancelAsked,
@@ -65,6 +66,7 @@ class Driver:
         on_change: Callable[[TaskRecord], None],
         give_up: Failure | None = None,
         elapsed_s: float = 0.0,
+        unknown: Unknown | None = None,
     ) -> None:
         self._around = around
         self.ended = False
@@ -73,6 +75,7 @@ class Driver:
         """Why the task is to be ended instead of driven: earlier drivers of it broke."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
         self._keeper = Keeper(around.plane, record, version, on_change, elapsed_s)
+        self._keeper.unknown = unknown or {}
         self._keeper.on_written = self._written
         self._keeper.on_published = around.recovery.published
         self._orders = Orders(around, self.tell)

@@ -14,6 +14,7 @@ from appliance.plane.node import Plane
 from appliance.tasks import machine
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.soundness import Unknown, with_unknown
 from appliance.tasks.surroundings import task_key
 
 
@@ -40,6 +41,8 @@ class Keeper:
         self._on_change = on_change
         self._pending: list[Transition] = []
         self._dirty = False
+        self.unknown: Unknown = {}
+        """Fields of the record that this version does not know, and keeps."""
         self.ready_ns: dict[str, int] = {}
         """When each subtask became ready, on this machine's clock."""
         self._since = time.monotonic() - max(record.elapsed_s, elapsed_s)
@@ -96,7 +99,7 @@ class Keeper:
                 # the whole site takes from the middle of a task is done again under the same effect ids.
                 self._version = await self._plane.dht.write(
                     task_key(self.record.id),
-                    encode(self.record),
+                    with_unknown(self.record, self.unknown),
                     expected=self._version,
                     durable=self.record.state.final,
                 )
@@ -110,7 +113,7 @@ class Keeper:
             self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
             self.on_published(transition)
         self._pending.clear()
-        self._plane.session.put(self._plane.keys.task(self.record.id), encode(self.record))
+        self._plane.session.put(self._plane.keys.task(self.record.id), with_unknown(self.record, self.unknown))
         self._on_change(self.record)
 
     def take(self, transition: Transition, *, durable: bool = True) -> bool:

@@ -63,6 +63,7 @@ from appliance.tasks.placement import Placement
 from appliance.tasks.recovery import Recovery
 from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.soundness import unknown, unsound
 from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, task_key
 
 log = structlog.get_logger(__name__)
@@ -249,10 +250,12 @@ class TaskManager:
 
     # --- driving --------------------------------------------------------------------------------------------
 
-    def _drive(self, record: TaskRecord, version: VersionVector) -> None:
+    def _drive(self, record: TaskRecord, version: VersionVector, value: bytes = b"") -> None:
         if record.id in self._drivers or self._stopping:
             return
-        give_up = self._why.get(record.id) if self._breaks[record.id] >= MAX_BREAKS else None
+        give_up = self._why.get(record.id) if self._breaks[record.id] >= MAX_BREAKS else unsound(record)
+        if give_up is not None and value and self._breaks[record.id] < MAX_BREAKS:
+            self.plane.session.refuse("unsound task record", task=record.id, reason=give_up.message)
         driver = Driver(
             self,
             record,
@@ -260,6 +263,7 @@ class TaskManager:
             on_change=self._moved,
             give_up=give_up,
             elapsed_s=self._ages.elapsed_s(record),
+            unknown=unknown(value) if value else None,
         )
         self._drivers[record.id] = driver
         task = asyncio.create_task(driver.run(), name=f"drive {record.id}")
@@ -328,11 +332,17 @@ class TaskManager:
             except PayloadError as error:
                 log.warning("task record cannot be read", key=stored.key, reason=str(error))
                 continue
+            if task_key(record.id) != stored.key:
+                # Driven under the name it gives itself it would be written over another task's record.
+                reason = f"it is of {record.id[:80]!r}"
+                self.plane.session.refuse("misplaced task record", key=stored.key, reason=reason)
+                final[stored.key] = stored.version
+                continue
             if record.state.final:
                 final[stored.key] = stored.version
                 self._heal_ended(record, stored.version)
             elif record.id not in self._drivers:
-                self._drive(record, stored.version)
+                self._drive(record, stored.version, stored.value)
             elif unheard(record, self._drivers[record.id].record):
                 # Two coordinators have met: whoever drives by the version before goes on from the merged one.
                 self._driving[record.id].cancel()

@@ -469,3 +469,25 @@ async def test_a_gateway_that_stood_still_orders_nothing_until_it_knows(fleet: F
         await asyncio.wait_for(asyncio.shield(writing), 0.2)
     pulse._until = 0.0
     assert await writing == {"g0": 1, "g2": 2}
+
+
+async def test_two_fleets_on_one_network_keep_their_tasks_apart(free_port: int, tmp_path: Path) -> None:
+    """Gateways of two fleets on one Zenoh network, one id in both: neither sees the other's records or members."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    one = await Plane.open(PlaneConfig(listen=(endpoint,)), fleet="one", gateway="gw-1", data_dir=tmp_path / "one")
+    other = await Plane.open(PlaneConfig(connect=(endpoint,)), fleet="two", gateway="gw-1", data_dir=tmp_path / "two")
+    try:
+        async with asyncio.timeout(20):
+            while not (one.session.linked and other.session.linked):
+                await asyncio.sleep(0.01)
+        await one.dht.write("task/t-1", b"of one", expected=None)
+        await other.dht.write("task/t-1", b"of two", expected=None)
+        for plane, value in ((one, b"of one"), (other, b"of two")):
+            record = await plane.dht.read("task/t-1")
+            assert record is not None
+            assert record.value == value
+            assert plane.members() == {"gw-1"}
+        assert await one.dht.read("task/t-2") is None
+    finally:
+        await one.close()
+        await other.close()

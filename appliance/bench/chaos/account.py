@@ -19,6 +19,8 @@ from appliance.model import SubtaskState, TaskRecord
 from appliance.tasks.machine import Transition, TransitionKind
 
 MOST_EVIDENCE = 50
+LATE_NS = 2_000_000_000
+"""What is said of a gateway so long after it is back is not about that outage."""
 
 
 class Down(Struct, kw_only=True):
@@ -151,7 +153,9 @@ class Follower:
         """Hear from a gateway that it has lost another."""
         for down in reversed(self.downs):
             if down.gateway == member:
-                down.noticed_ns.setdefault(by, now_ns)
+                # Later it is another loss: of a link, or of a gateway that stands still under the load.
+                if not down.until_ns or now_ns < down.until_ns + LATE_NS:
+                    down.noticed_ns.setdefault(by, now_ns)
                 return
 
     def down(self, gateway: str, kind: str, now_ns: int, wall_ns: int) -> Down:

@@ -4,12 +4,23 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Any, cast
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from appliance.client import _news
 from appliance.errors import DeadlineError, PayloadError, UnreachableError
-from appliance.model import PoolHint, RunEvent, RunEventKind, Site, Subtask, TaskRequest, TaskState, encode
+from appliance.model import (
+    PoolHint,
+    RunEvent,
+    RunEventKind,
+    Site,
+    Subtask,
+    SubtaskRecord,
+    TaskRequest,
+    TaskState,
+    encode,
+)  # fmt: skip
 from appliance.plane.dht import Record
 from appliance.pool.api import Hinted
 from appliance.tasks import manager as module
@@ -138,6 +149,41 @@ async def test_a_driver_that_breaks_again_and_again_ends_its_task_with_the_reaso
     assert record.state is TaskState.FAILED
     assert record.failure is not None
     assert "too large" in record.failure.message
+
+
+async def test_an_unsound_record_is_ended_with_the_reason(manager: TaskManager, plane: Any) -> None:
+    """A stranger's record whose subtasks wait for each other is not driven for ever: it fails, says why, is counted."""
+    circle = tuple(
+        SubtaskRecord(subtask=Subtask(id=name, skill="photograph", after=(after,)))
+        for name, after in (("s1", "s2"), ("s2", "s1"))
+    )
+    forged = replace(plane.accepted(plan=plane.plan_of()), state=TaskState.RUNNING, subtasks=circle, sequence=2)
+    await plane.dht.write("task/t-1", encode(forged), expected=None)
+    manager._sweep.set()
+    async with asyncio.timeout(5):
+        while not (record := await manager.task(TaskAsk(id="t-1"))).state.final:
+            await asyncio.sleep(0.02)
+    assert record.state is TaskState.FAILED
+    assert record.failure is not None
+    assert "wait for each other" in record.failure.message
+    assert plane.session.refused["unsound task record"] >= 1
+
+
+async def test_a_record_under_anothers_name_is_left_alone(manager: TaskManager, plane: Any) -> None:
+    """A record that says it is of another task is counted and not driven: that one's would be written over."""
+    await plane.dht.write("task/t-2", encode(plane.accepted(plan=plane.plan_of())), expected=None)
+    manager._sweep.set()
+    await until(lambda: plane.session.refused.get("misplaced task record") == 1)
+    assert manager.unfinished == 0
+
+
+async def test_fields_of_a_later_version_stay_in_the_record(manager: TaskManager, plane: Any) -> None:
+    """What this version does not know of a record that it takes up is written back with what it does."""
+    value = msgspec.json.decode(encode(plane.accepted(plan=plane.plan_of()))) | {"colour": {"of": "later"}}
+    await plane.dht.write("task/t-1", encode(value), expected=None)
+    manager._sweep.set()
+    await until(lambda: "subtasks" in msgspec.json.decode(plane.dht.records["task/t-1"].value))
+    assert msgspec.json.decode(plane.dht.records["task/t-1"].value)["colour"] == {"of": "later"}
 
 
 async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, plane: Any) -> None:
