@@ -29,7 +29,7 @@ from appliance.pool.api import (
     Warmed,
 )
 from appliance.pool.transfer.api import Brought, FetchAsk
-from appliance.tasks.api import AgreeAsk, PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.api import AgreeAsk, PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk, WhyAsk
 from appliance.tasks.migration.api import (
     DrainAsk,
     DrainState,
@@ -42,6 +42,7 @@ from appliance.tasks.migration.api import (
 from appliance.tasks.migration.moving import MOVE_S
 from appliance.tasks.watch.lines import Line
 from appliance.tasks.watch.stream import Stream
+from appliance.tasks.why import TaskWhy
 
 R = TypeVar("R", bound=Struct)
 
@@ -137,6 +138,10 @@ class FleetClient:
     async def agree(self, task: str, *, agree: bool = True, by: str = "") -> TaskRecord:
         """Say yes or no to the plan that is proposed for a task after a failure."""
         return await self._ask("agree", AgreeAsk(id=task, agree=agree, by=by), TaskRecord)
+
+    async def why(self, task: str, subtask: str = "") -> TaskWhy:
+        """Why a task waits, or was served where it was; NotFoundError when there is no such task or subtask."""
+        return await self._ask("why", WhyAsk(id=task, subtask=subtask), TaskWhy)
 
     async def cancel(self, task: str) -> TaskRecord:
         """Stop a task."""

@@ -4,12 +4,11 @@ Rich finds out whether it writes to a terminal: without one there are no colours
 """
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
-from rich.console import Console, Group, RenderableType
-from rich.padding import Padding
+from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
@@ -17,7 +16,6 @@ from appliance.console_watch import revision_lines
 from appliance.doctor import Check
 from appliance.model import (
     PLAIN_PRIORITY,
-    Choice,
     ContainerInfo,
     GatewayStatus,
     Plan,
@@ -33,7 +31,6 @@ from appliance.pool.images import ImageState
 from appliance.pool.transfer.api import Brought
 from appliance.record.facts import LogInfo
 from appliance.tasks.replay import ReplayReport
-from appliance.tasks.why import AttemptWhy, TaskWhy
 
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
@@ -263,58 +260,6 @@ def container_table(containers: Sequence[ContainerInfo]) -> Table:
             str(each.runs),
             milliseconds(each.cold_ms),
             each.run,
-        )
-    return table
-
-
-def why_text(found: TaskWhy) -> Group:
-    """Why each attempt was served where it was: who decided, and a table of what was weighed. Fits 80 columns."""
-    parts: list[RenderableType] = [
-        Text.assemble(("task ", "bold"), found.id, f" {found.state}  coordinated by {found.coordinator}")
-    ]
-    for each in found.subtasks:
-        waits = f"  {each.note}" if each.note and not each.attempts else ""
-        parts.append(Text.assemble("\n", (each.id, "bold"), f" {each.skill}  {each.state}{waits}"))
-        for attempt in each.attempts:
-            parts.extend(_attempt_text(attempt))
-    return Group(*parts)
-
-
-def _attempt_text(attempt: AttemptWhy) -> Iterator[RenderableType]:
-    served = f", container {attempt.container[:12]}, {attempt.phase}" if attempt.container else ""
-    yield Text(f"  attempt {attempt.number} on {attempt.gateway}{served}")
-    if attempt.placed:
-        yield Padding(Text(f"gateways by coarse score: {attempt.placed}", style="dim"), (0, 0, 0, 4))
-    if attempt.choice is not None:
-        choice = attempt.choice
-        yield Padding(Text(f"{choice.by} decided: {choice.way}, {choice.why}"), (0, 0, 0, 4))
-        if choice.considered:
-            yield Padding(_considered_table(choice), (0, 0, 0, 4))
-    elif not attempt.failure:
-        yield Padding(Text("how its container was chosen is not known (yet)", style="dim"), (0, 0, 0, 4))
-    if attempt.failure is not None:
-        yield Padding(Text(f"failed: {attempt.failure.message}", style="red"), (0, 0, 0, 4))
-
-
-def _considered_table(choice: Choice) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold dim", padding=(0, 1, 0, 0))
-    table.add_column("")
-    table.add_column("gateway", overflow="fold", max_width=14)
-    table.add_column("container", no_wrap=True)
-    table.add_column("way", no_wrap=True)
-    table.add_column("score", justify="right", no_wrap=True)
-    table.add_column("cost", justify="right", no_wrap=True)
-    table.add_column("verdict", overflow="fold")
-    for each in choice.considered:
-        table.add_row(
-            "▸" if each.taken else "",
-            each.gateway,
-            each.container[:8] or "–",
-            str(each.way),
-            f"{each.score:.2f}" if each.container else "–",
-            milliseconds(each.cost_ms) if each.image else "–",
-            each.verdict,
-            style="" if each.taken else "dim",
         )
     return table
 

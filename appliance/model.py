@@ -414,7 +414,8 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     submitter: str = ""
     """Whose task it is: those who wait for a container are served in fair turns."""
     group: tuple[str, ...] = ()
-    """Members of the task's group, to which it may be passed on; empty: any gateway."""
+    """Gateways that it may be passed on to, as the task's submitter wished; empty: any. The task's own group is no
+    limit here: its members are asked first, but a container that is ready elsewhere counts for more."""
     anew: bool = False
     """Passed on, it may be started in a new container as well: whoever passes it on has no room for one."""
     moves: int = 0

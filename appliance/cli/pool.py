@@ -10,6 +10,7 @@ from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
 from appliance.errors import ConfigError
 from appliance.pool.api import WarmAsk
+from appliance.reasons import why_text
 from appliance.tasks.why import why
 
 pool_app = App(name="pool", help="Warm containers: what there is, why it was chosen, and what is kept.", group=WORK)
@@ -52,7 +53,7 @@ def pool_why(task: str, subtask: str = "", *, as_json: Json = False, where: Wher
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             found = why(await client.task(task), subtask)
-        show(found, as_json=as_json, table=console.why_text(found))
+        show(found, as_json=as_json, table=why_text(found))
 
     asyncio.run(go())
     return 0

@@ -15,6 +15,7 @@ from appliance.client import FleetClient
 from appliance.console_watch import stream_line
 from appliance.errors import NotFoundError, PayloadError, SwiftbotError
 from appliance.model import PLAIN_PRIORITY, TaskRecord, TaskRequest, TaskState
+from appliance.reasons import why_text
 from appliance.tasks.view import view
 
 task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agree to new plans.", group=WORK)
@@ -211,6 +212,26 @@ def task_agree(
 
     record = asyncio.run(go())
     show(view(record), as_json=as_json, table=console.task_table(record))
+    return 0
+
+
+@task_app.command(name="why")
+def task_why(task: str, subtask: str = "", *, as_json: Json = False, where: Where = HERE) -> int:
+    """Show why a task waits or ran where it did: its group, who could serve it, who not, its place, when it may start.
+
+    Args:
+        task: The task.
+        subtask: One of its subtasks; all when none is given.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            found = await client.why(task, subtask)
+        show(found, as_json=as_json, table=why_text(found))
+
+    asyncio.run(go())
     return 0
 
 

@@ -96,6 +96,14 @@ class RunStatus(Struct, frozen=True, kw_only=True):
     """In how many seconds it may have one; None: not known."""
 
 
+class WhyAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`why`: what does a task wait for, or one of its subtasks? `here` asks the coordinator itself."""
+
+    id: str
+    subtask: str = ""
+    here: bool = False
+
+
 class SkillsAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """`skills`: which skills does this gateway know?"""
 

@@ -95,6 +95,11 @@ class Driver:
         return self._keeper.record
 
     @property
+    def elapsed_s(self) -> float:
+        """Seconds since the task was accepted."""
+        return self._keeper.elapsed_s
+
+    @property
     def settled(self) -> bool:
         """Whether all that is known is written, and nothing is awaited of this gateway's own runs."""
         return self._keeper.settled

@@ -247,7 +247,7 @@ class Executor:
         """Gateways that the run may not be passed on to."""
         if not request.group:
             return {}
-        return {each: "outside the task's group" for each in self._plane.members() if each not in request.group}
+        return {each: "the submitter does not allow it" for each in self._plane.members() if each not in request.group}
 
     def _check(self, request: RunRequest) -> None:
         """Refuse what must not begin (any more)."""

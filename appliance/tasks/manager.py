@@ -47,12 +47,13 @@ from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
 from appliance.tasks.admission import Ends, checked, expectation, full, longest_s
 from appliance.tasks.agreeing import Agreeing
-from appliance.tasks.api import PlanAnswer, PlanAsk, SkillsAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.api import PlanAnswer, PlanAsk, SkillsAsk, TaskAsk, TaskList, TasksAsk, WhyAsk
 from appliance.tasks.bounds import MAX_TEXT, clean, read_record
 from appliance.tasks.checkpoints import Checkpoint, read_checkpoint, remove_checkpoint
 from appliance.tasks.deadline import Ages
 from appliance.tasks.driver import Driver
 from appliance.tasks.executor import Executor
+from appliance.tasks.explaining import explain
 from appliance.tasks.healing import heal, unheard
 from appliance.tasks.keeper import Keeper
 from appliance.tasks.line import Place
@@ -65,6 +66,7 @@ from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.soundness import unknown, unsound
 from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, task_key
+from appliance.tasks.why import TaskWhy, why
 
 log = structlog.get_logger(__name__)
 
@@ -148,6 +150,7 @@ class TaskManager:
         rpc.register("tasks", TasksAsk, self.tasks)
         rpc.register("cancel", TaskAsk, self.cancel)
         rpc.register("cancel_here", TaskAsk, self.cancel_here)
+        rpc.register("why", WhyAsk, self.why)
         rpc.register("skills", SkillsAsk, self.scheduler.skills)
         Agreeing(self.plane, self._drivers, self.task).register()
         news = self.plane.session.subscribe_typed(self.plane.keys.run(), RunEvent, self._on_run_event)
@@ -494,6 +497,23 @@ class TaskManager:
         if stored is None or stored.deleted:
             raise NotFoundError(f"there is no task {ask.id}", remedy="see `swiftbot task list`")
         return read_record(stored.value)
+
+    async def why(self, ask: WhyAsk) -> TaskWhy:
+        """Tell why a task waits, or was served where it was; its coordinator knows what is in no record."""
+        if driver := self._drivers.get(ask.id):
+            return await explain(
+                driver.record,
+                ask.subtask,
+                plane=self.plane,
+                scheduler=self.scheduler,
+                durations=self._ahead.durations,
+                elapsed_s=driver.elapsed_s,
+            )
+        record = await self.task(TaskAsk(id=ask.id))
+        owner = self.plane.ring.owner(task_key(ask.id))
+        if not (record.state.final or ask.here or owner == self.plane.gateway):
+            return await self.plane.rpc.call(owner, "why", replace(ask, here=True), TaskWhy)
+        return why(record, ask.subtask)
 
     async def tasks(self, ask: TasksAsk) -> TaskList:
         """Return the newest tasks, of the whole fleet or of this gateway's shard."""

@@ -62,7 +62,7 @@ def request_for(
         priority=record.priority,
         due_s=max(0.001, record.deadline_s - elapsed_s) if record.deadline_s else 0.0,
         submitter=record.submitter,
-        group=record.group.members if record.group else (),
+        group=record.within,
         moves=sum(bool(each.left) for each in target.attempts),
         avoid=tuple(sorted({each.gateway for each in target.attempts if each.failure and each.gateway})),
     )

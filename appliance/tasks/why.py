@@ -1,9 +1,15 @@
-"""Why each attempt of a task was served where it was: a record's reasons, flat, as `swiftbot pool why` prints them."""
+"""Why each attempt of a task was served where it was: a record's reasons, flat, as `swiftbot pool why` prints them.
+
+`swiftbot task why` prints the same with what its coordinator knows besides (`explaining`).
+"""
+
+from collections.abc import Mapping
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.errors import NotFoundError
-from appliance.model import Attempt, Choice, Failure, SubtaskRecord, TaskRecord
+from appliance.model import PLAIN_PRIORITY, Attempt, Choice, Failure, Group, SubtaskRecord, TaskRecord
 
 
 class AttemptWhy(Struct, frozen=True, kw_only=True):
@@ -20,6 +26,29 @@ class AttemptWhy(Struct, frozen=True, kw_only=True):
     failure: Failure | None
 
 
+class CandidateWhy(Struct, frozen=True, kw_only=True):
+    """A gateway with its coarse score for a subtask, or why it is no candidate."""
+
+    gateway: str
+    score: float | None = None
+    excluded: str = ""
+
+
+class Waits(Struct, frozen=True, kw_only=True):
+    """What a subtask that has not ended waits for, as its coordinator knows it just now."""
+
+    reason: str
+    at: str = ""
+    """The gateway in whose queue it is; empty: it is with its coordinator."""
+    position: int = 0
+    """Its place in that queue or among those that wait for room, from 1; 0: in none."""
+    waiting: int = 0
+    expected_s: float | None = None
+    """In how many seconds it is expected to start; None: not known."""
+    candidates: tuple[CandidateWhy, ...] = ()
+    """The best first, then those that cannot serve it."""
+
+
 class SubtaskWhy(Struct, frozen=True, kw_only=True):
     """A subtask with its attempts; `note` says what one without any waits for."""
 
@@ -28,6 +57,8 @@ class SubtaskWhy(Struct, frozen=True, kw_only=True):
     state: str
     note: str
     attempts: tuple[AttemptWhy, ...]
+    waits: Waits | None = None
+    """None where it has ended, or the coordinator was not asked."""
 
 
 class TaskWhy(Struct, frozen=True, kw_only=True):
@@ -37,6 +68,15 @@ class TaskWhy(Struct, frozen=True, kw_only=True):
     state: str
     coordinator: str
     subtasks: tuple[SubtaskWhy, ...]
+    submitter: str = ""
+    priority: int = PLAIN_PRIORITY
+    deadline_s: float = 0.0
+    left_s: float | None = None
+    """Seconds until its deadline; None without one, or where the coordinator was not asked."""
+    note: str = ""
+    """What it had to expect when it was accepted and planned."""
+    group: Group | None = None
+    """The gateways that serve it, its root, and how that came about."""
 
 
 def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
@@ -52,7 +92,18 @@ def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
         state=str(record.state),
         coordinator=record.coordinator,
         subtasks=tuple(_subtask(each) for each in chosen),
+        submitter=record.submitter,
+        priority=record.priority,
+        deadline_s=record.deadline_s,
+        note=record.note,
+        group=record.group,
     )
+
+
+def with_waits(found: TaskWhy, waits: Mapping[str, Waits], *, left_s: float | None) -> TaskWhy:
+    """Return the reasons with what each subtask waits for, by id."""
+    subtasks = tuple(replace(each, waits=waits.get(each.id)) for each in found.subtasks)
+    return replace(found, subtasks=subtasks, left_s=left_s)
 
 
 def _subtask(record: SubtaskRecord) -> SubtaskWhy:

@@ -23,6 +23,7 @@ from appliance.model import (
     encode,
 )
 from appliance.pool.api import Evicted, PoolDecision
+from appliance.reasons import why_text
 from appliance.tasks.view import view
 from appliance.tasks.why import TaskWhy, why
 
@@ -88,7 +89,7 @@ def shown(what: Any) -> str:
 
 def test_why_tells_who_decided_and_what_was_weighed_at_80_columns() -> None:
     """Each attempt with its gateway, scores, costs, ways and verdicts; nothing is cut off."""
-    text = shown(console.why_text(why(RECORD)))
+    text = shown(why_text(why(RECORD)))
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     flat = " ".join(text.split())
     for part in (

@@ -110,11 +110,11 @@ async def test_a_deadline_counts_over_a_takeover_and_while_planning(bench: Any) 
 
 
 async def test_a_group_is_in_the_record_before_anything_is_sent(bench: Any) -> None:
-    """The transition comes before the dispatch, and the order names the members."""
+    """The transition comes before the dispatch; the order names the gateways that the submitter allows."""
     bench.around.groups = [Group(members=("gw-1", "gw-2"), root="gw-1", why="formed")]
-    await bench.start()
+    await bench.start(replace(bench.plane.accepted(), within=("gw-1", "gw-2", "gw-3")))
     _, request = await bench.ordered()
-    assert request.group == ("gw-1", "gw-2")
+    assert request.group == ("gw-1", "gw-2", "gw-3")
     stored = bench.stored()
     assert stored.group is not None
     assert stored.group.root == "gw-1"
