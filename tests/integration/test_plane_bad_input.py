@@ -1,0 +1,123 @@
+"""What others may send that is wrong but well-formed: clocks far off, forged and outdated versions, another fleet."""
+
+import asyncio
+import contextlib
+import datetime as dt
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from appliance.errors import ConflictError, PayloadError
+from appliance.model import GatewayStatus, encode
+from appliance.plane.dht import Found, KeyAsk, StoreAsk
+from appliance.plane.node import Plane
+from appliance.plane.session import Session
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.versions import Record, descends
+
+pytestmark = pytest.mark.anyio
+
+
+async def _until(condition: Callable[[], object]) -> None:
+    """Wait until something is so; the test's own timeout bounds it."""
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
+@contextlib.asynccontextmanager
+async def _planes(folder: Path, ports: list[int], *fleets: str) -> AsyncIterator[list[Plane]]:
+    """Two gateways, g0 and g1, for each fleet, all linked with each other."""
+    ends = [f"tcp/127.0.0.1:{port}" for port in ports]
+    planes: list[Plane] = []
+    try:
+        for at, fleet in enumerate(fleets):
+            for number in range(2):
+                own = 2 * at + number
+                config = PlaneConfig(listen=(ends[own],), connect=tuple(end for end in ends if end != ends[own]))
+                data = folder / f"{fleet}-{number}"
+                planes.append(await Plane.open(config, fleet=fleet, gateway=f"g{number}", data_dir=data))
+        await _until(lambda: all(len(each.members()) == 2 and each.dht.reconciled() for each in planes))
+        yield planes
+    finally:
+        for plane in planes:
+            await plane.close()
+
+
+async def test_two_fleets_on_one_network_do_not_meet(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """Gateways of two fleets with the same ids, linked with each other: each fleet has its own members and records."""
+    async with _planes(tmp_path, free_ports(4), "north", "south") as planes:
+        for plane in planes:
+            assert plane.members() == {"g0", "g1"}
+        for number in range(20):
+            for plane, value in ((planes[0], b"north"), (planes[2], b"south")):
+                await plane.dht.write(f"task/{number}", value, expected=None)
+        for number in range(20):
+            for plane, value in zip(planes, (b"north", b"north", b"south", b"south"), strict=True):
+                record = await plane.dht.read(f"task/{number}")
+                assert record is not None
+                assert record.value == value
+        planes[0].registry.publish_status(GatewayStatus(id="g0", fleet="north"))
+        await _until(lambda: "g0" in planes[1].registry.gateways)
+        assert not planes[3].registry.gateways
+        assert all(not plane.session.refused for plane in planes)
+
+
+@pytest.mark.parametrize("hours", [1, -1])
+async def test_a_clock_that_is_an_hour_off(tmp_path: Path, free_ports: Callable[..., list[int]], hours: int) -> None:
+    """Facts stamped an hour ahead or behind are believed all the same, later ones replace them, and writes go on."""
+    async with _planes(tmp_path, free_ports(2), "f") as (one, other):
+        off = Session(other.config, "f", one.session._raw, asyncio.get_running_loop())
+        when = dt.datetime.now(dt.UTC) + dt.timedelta(hours=hours)
+        stamp = zenoh.Timestamp(when, one.session._raw.new_timestamp().get_id())
+        status = GatewayStatus(id="g0", fleet="f", load=0.25)
+        off._raw.put(off.keys.status("g0"), encode(status), timestamp=stamp)
+        await _until(lambda: "g0" in other.registry.gateways)
+        one.registry.publish_status(GatewayStatus(id="g0", fleet="f", load=0.75))
+        await _until(lambda: other.registry.gateways["g0"].load == 0.75)
+        version = await one.dht.write("task/1", b"1", expected=None)
+        assert descends(await other.dht.write("task/1", b"2", expected=version), version)
+
+
+async def test_outdated_and_forged_versions_lose_nothing(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """Older copies change nothing, forged ones are resolved like any other, impossible ones are refused and counted."""
+    async with _planes(tmp_path, free_ports(2), "f") as (one, other):
+        first = await one.dht.write("task/1", b"1", expected=None)
+        second = await one.dht.write("task/1", b"2", expected=first)
+        old = StoreAsk(Record(key="task/1", value=b"1", version=first, write="w"))
+        answer = await one.rpc.call("g1", "dht_store", old, Found)
+        assert answer.record is not None
+        assert answer.record.version == second
+        aside = Record(key="task/1", value=b"0", version={"g9": 7}, write="x")
+        told = (await one.rpc.call("g1", "dht_store", StoreAsk(aside), Found, direct=True)).record
+        assert told is not None
+        assert told.value == b"2"
+        assert descends(told.version, second)
+        assert descends(told.version, aside.version)
+        for version in ({}, {"g0": 0}, {"g0": -1}, {"g0": 2**53}, {"no name": 1}, {f"g{n}": 1 for n in range(300)}):
+            for direct in (False, True):
+                ask = StoreAsk(Record(key="task/1", value=b"", version=version))
+                with pytest.raises(PayloadError):
+                    await one.rpc.call("g1", "dht_store", ask, Found, direct=direct)
+        assert other.session.refused["malformed gw/g1/rpc/dht_store"] == 12
+        with pytest.raises(ConflictError):
+            await other.dht.write("task/1", b"3", expected={"g0": 2**40})
+        read = await other.dht.read("task/1")
+        assert read is not None
+        assert read.value == b"2"
+
+
+async def test_what_is_not_known_is_kept(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """A value is bytes to the plane: fields of a later version come back as they were written, also when copies met."""
+    async with _planes(tmp_path, free_ports(2), "f") as (one, _):
+        value = b'{"id":"t-1","of_a_later_version":{"deep":[1,2,{"x":null}]}}'
+        await one.dht.write("task/t-1", value, expected=None)
+        aside = Record(key="task/t-1", value=b"", version={"g9": 1}, write="x")
+        await one.rpc.call("g1", "dht_store", StoreAsk(aside), Found)
+        body = b'{"key":"task/t-1","later":{"a":1}}'
+        found = await one.session.query(one.keys.rpc("g1", "dht_read"), body, timeout_s=5)
+        assert b'"record"' in found
+        answer = await one.rpc.call("g1", "dht_read", KeyAsk("task/t-1"), Found)
+        assert answer.record is not None
+        assert answer.record.value == value
