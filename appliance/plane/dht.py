@@ -14,11 +14,11 @@ from functools import partial
 from typing import Any
 
 import structlog
-from msgspec import Struct
 
 from appliance.errors import ConflictError, DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
 from appliance.plane.membership import Membership
+from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, StoreAsk, Written
 from appliance.plane.pulse import Pulse
 from appliance.plane.quorum.voting import Voting
 from appliance.plane.ring import Ring
@@ -51,49 +51,6 @@ _SETTLE_S = 2.0
 _PUSH_AGAIN_S = (0.5, 2.0)
 """When a replica that was too slow for a write is offered the record again."""
 _MOST_PUSHES = 256
-
-
-class KeyAsk(Struct, frozen=True):
-    """`dht_read`: the record of a key, from this gateway's shard."""
-
-    key: str
-
-
-class Found(Struct, frozen=True, omit_defaults=True):
-    """Answer with a record, or that there is none."""
-
-    record: Record | None = None
-
-
-class StoreAsk(Struct, frozen=True):
-    """`dht_store`: keep this version, unless a newer one is here."""
-
-    record: Record
-
-
-class Written(Struct, frozen=True):
-    """`dht_write` done: the version it made."""
-
-    version: VersionVector
-
-
-class RecordAsk(Struct, frozen=True, omit_defaults=True):
-    """`record_read`: a record, from whoever holds it; the answer of `read`, tombstones left out."""
-
-    key: str
-    quorum: bool = False
-
-
-class RecordChange(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """`record_write`: compare and set, through any gateway."""
-
-    key: str
-    value: bytes = b""
-    deleted: bool = False
-    expected: VersionVector | None = None
-    quorum: bool = False
-    write: str = ""
-    """An id of the caller's own makes asking again safe; empty: one is made."""
 
 
 class Dht:

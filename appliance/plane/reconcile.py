@@ -16,9 +16,10 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
-from appliance.plane.dht import Dht, Found, StoreAsk
+from appliance.plane.dht import Dht
 from appliance.plane.keys import check_name
 from appliance.plane.membership import Membership
+from appliance.plane.messages import Found, StoreAsk
 from appliance.plane.partners import partners, sharing
 from appliance.plane.pulse import Pulse
 from appliance.plane.ring import Ring

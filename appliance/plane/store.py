@@ -7,8 +7,6 @@ FULL and 0.03 ms without, so only what may be lost with the power (`durable=Fals
 
 import asyncio
 import contextlib
-import fcntl
-import os
 import sqlite3
 import threading
 import time
@@ -21,8 +19,9 @@ from typing import Any, NamedTuple, TypeVar, cast
 import msgspec
 import structlog
 
-from appliance.errors import ConfigError, PrerequisiteError, RefusedError, SwiftbotError
+from appliance.errors import RefusedError
 from appliance.model import VersionVector
+from appliance.plane.file import File, problem_of
 from appliance.plane.picture import Picture
 from appliance.plane.versions import Record, digest
 
@@ -30,18 +29,9 @@ log = structlog.get_logger(__name__)
 
 T = TypeVar("T")
 
-SCHEMA = 1
 _MOST_WAITING = 10_000
 _MOST_TOGETHER = 128
 """Calls in one commit: enough to amortise it, few enough that the first does not wait long."""
-_BUSY_S = 5.0
-
-_TABLES = """
-CREATE TABLE IF NOT EXISTS records (
-    key TEXT PRIMARY KEY, value BLOB NOT NULL, version TEXT NOT NULL, deleted INTEGER NOT NULL,
-    write TEXT NOT NULL, digest TEXT NOT NULL, updated_ns INTEGER NOT NULL);
-CREATE TABLE IF NOT EXISTS kept (key TEXT PRIMARY KEY, value BLOB NOT NULL);
-"""
 
 
 class _Call(NamedTuple):
@@ -57,14 +47,12 @@ class Store:
 
     def __init__(self, path: Path, loop: asyncio.AbstractEventLoop) -> None:
         self.path = path
-        self.set_aside: Path | None = None
-        """Where a file that could not be read was moved at start."""
         self._loop = loop
         self._waiting: deque[_Call] = deque()
         self._some = threading.Condition()
         self._closing = False
-        self._lock = -1
-        self._synchronous = ""
+        self._file = File(path)
+        self._synchronous = "FULL"
         self._picture = Picture()
         self._changed: list[Record | str] = []
         """What the open transaction has put (records) and dropped (keys)."""
@@ -83,6 +71,11 @@ class Store:
         store._thread.start()
         await store._opened
         return store
+
+    @property
+    def set_aside(self) -> Path | None:
+        """Where a file that could not be read was moved at start."""
+        return self._file.set_aside
 
     # --- plain keys -------------------------------------------------------------------------------------------
 
@@ -265,7 +258,7 @@ class Store:
 
     def _run(self) -> None:
         try:
-            db = self._connect()
+            db = self._file.connect()
             self._picture = Picture(row[0] for row in db.execute("SELECT key FROM records"))
         except Exception as error:  # noqa: BLE001 - supervision boundary: whatever went wrong must reach the caller of `open`
             self._post(self._opened, None, error)
@@ -276,7 +269,7 @@ class Store:
         with contextlib.suppress(sqlite3.Error):
             db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.close()
-        os.close(self._lock)
+        self._file.release()
 
     def _take(self) -> list[_Call]:
         with self._some:
@@ -293,7 +286,7 @@ class Store:
                 for call in batch:
                     self._do(db, [call])
                 return
-            problem = _problem(error, self.path)
+            problem = problem_of(error, self.path)
             log.error("the store failed", path=str(self.path), reason=str(problem))  # noqa: TRY400 - cause named
             outcomes = [(None, problem)]
         for call, (result, error) in zip(batch, outcomes, strict=True):
@@ -355,91 +348,12 @@ class Store:
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(settle)
 
-    def _connect(self) -> sqlite3.Connection:
-        self._acquire()
-        try:
-            try:
-                return self._prepare()
-            except sqlite3.Error as error:
-                if not _damaged(error):
-                    raise
-                self._move_aside(str(error))
-            return self._prepare()
-        except sqlite3.Error as error:
-            os.close(self._lock)
-            raise _problem(error, self.path) from error
-        except BaseException:
-            os.close(self._lock)
-            raise
-
-    def _acquire(self) -> None:
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            self._lock = os.open(f"{self.path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise ConfigError(
-                f"{self.path} cannot be written: {error.strerror}", remedy="set data_dir to a writable folder"
-            ) from error
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._lock)
-            raise ConfigError(
-                f"{self.path} is in use by another gateway", remedy="give each gateway a data_dir of its own"
-            ) from error
-
-    def _prepare(self) -> sqlite3.Connection:
-        db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=_BUSY_S)
-        try:
-            db.execute("PRAGMA journal_mode = WAL")
-            self._synchronous = ""
-            self._set_synchronous(db, "FULL")
-            _check(db, self.path)
-            db.executescript(_TABLES)
-            db.execute(f"PRAGMA user_version = {SCHEMA}")
-        except BaseException:
-            db.close()
-            raise
-        return db
-
-    def _move_aside(self, reason: str) -> None:
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        aside = self.path.with_name(f"{self.path.name}.damaged-{stamp}")
-        number = 1
-        while aside.exists():
-            number += 1
-            aside = self.path.with_name(f"{self.path.name}.damaged-{stamp}-{number}")
-        for suffix in ("", "-wal", "-shm"):
-            part = self.path.with_name(self.path.name + suffix)
-            if part.exists():
-                part.rename(aside.with_name(aside.name + suffix))
-        self.set_aside = aside
-        log.error(
-            "the store's file is damaged and was moved aside; starting with an empty one",
-            path=str(self.path),
-            moved_to=str(aside),
-            reason=reason,
-            remedy="records come back from the replicas; what was only here may be saved with `sqlite3 FILE .recover`",
-        )
-
     async def close(self) -> None:
         """Do what waits, then close the file."""
         with self._some:
             self._closing = True
             self._some.notify()
         await asyncio.to_thread(self._thread.join)
-
-
-def _check(db: sqlite3.Connection, path: Path) -> None:
-    found = db.execute("PRAGMA quick_check(1)").fetchone()
-    if found != ("ok",):
-        raise sqlite3.DatabaseError(f"malformed: {found[0] if found else 'no answer'}")
-    version = db.execute("PRAGMA user_version").fetchone()[0]
-    if version > SCHEMA:
-        raise ConfigError(
-            f"{path} was written by a newer version (schema {version}, this one knows {SCHEMA})",
-            remedy="install that version again, or use another data_dir",
-        )
 
 
 _COLUMNS = "key, value, version, deleted, write"
@@ -469,21 +383,3 @@ def _looked_at(future: asyncio.Future[Record | None]) -> None:
 def _prefixed(prefix: str) -> tuple[str, tuple[str, ...]]:
     """The condition for keys of a prefix, so that the index serves it; code points end at U+10FFFF."""
     return ("WHERE key >= ? AND key < ?", (prefix, prefix + "\U0010ffff")) if prefix else ("", ())
-
-
-def _damaged(error: sqlite3.Error) -> bool:
-    text = str(error)
-    return "malformed" in text or "not a database" in text
-
-
-def _problem(error: sqlite3.Error, path: Path) -> SwiftbotError:
-    text = str(error)
-    if "full" in text:
-        return PrerequisiteError(f"the disk that holds {path} is full", remedy="free some space; nothing is lost")
-    if "readonly" in text or "unable to open" in text:
-        return ConfigError(f"{path} cannot be written: {text}", remedy="check the owner and rights of data_dir")
-    if _damaged(error):
-        return PrerequisiteError(
-            f"{path} is damaged: {text}", remedy="restart the gateway: it moves the file aside and asks the replicas"
-        )
-    return PrerequisiteError(f"{path} cannot be used: {text}", remedy="check the disk")

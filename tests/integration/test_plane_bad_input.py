@@ -11,7 +11,7 @@ import zenoh
 
 from appliance.errors import ConflictError, PayloadError
 from appliance.model import GatewayStatus, encode
-from appliance.plane.dht import Found, KeyAsk, StoreAsk
+from appliance.plane.messages import Found, KeyAsk, StoreAsk
 from appliance.plane.node import Plane
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig

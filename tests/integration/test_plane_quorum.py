@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from appliance.errors import ConfigError, ConflictError, RefusedError, SwiftbotError, UnreachableError
-from appliance.plane.dht import Found, RecordAsk, RecordChange, Written
+from appliance.plane.messages import Found, RecordAsk, RecordChange, Written
 from appliance.plane.node import STORE_FILE, Plane
 from appliance.plane.quorum.messages import AcceptAsk, PrepareAsk, VoteAsk, Voted
 from appliance.plane.quorum.register import Ballot

@@ -12,7 +12,7 @@ from appliance.bench.history.convergence import Write
 from appliance.bench.history.linearizable import Op
 from appliance.errors import ConflictError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
-from appliance.plane.dht import Found, RecordAsk, RecordChange, Written
+from appliance.plane.messages import Found, RecordAsk, RecordChange, Written
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 

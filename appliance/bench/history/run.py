@@ -29,7 +29,7 @@ from appliance.bench.net.faults import REST_S, Phase, phases
 from appliance.bench.pooled import fleet_name
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError
-from appliance.plane.dht import Found, KeyAsk
+from appliance.plane.messages import Found, KeyAsk
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
