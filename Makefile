@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .SILENT:
 .NOTPARALLEL:
-.PHONY: help setup demo test check lint formatted types contracts unit format lock images ray install uninstall clean ready
+.PHONY: help setup demo test check lint formatted types contracts unit format lock images ray train install uninstall clean ready
 
 # Taken as it is, without make expanding "$", and given on in the environment: any text may stand in it.
 override ASK := $(value ASK)
@@ -65,6 +65,7 @@ lock: ready ## Pin the dependencies anew in locks/ (UPGRADE=1: newest versions)
 	compile pyproject.toml -o locks/gateway.txt && \
 	compile pyproject.toml --group dev -c locks/gateway.txt -o locks/dev.txt && \
 	compile locks/tools.in -o locks/tools.txt && \
+	compile pyproject.toml --extra train -c locks/gateway.txt -o locks/train.txt && \
 	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' \
 	  | compile - -o locks/bench.txt
 
@@ -73,6 +74,9 @@ images: setup ## Build the container images (setup does so too)
 
 ray: ## Ray, which `swiftbot bench startup` compares with, in an environment of its own (220 MB)
 	scripts/setup.sh gateway --without-images --with-ray
+
+train: ## What `swiftbot train` needs (PyTorch), in an environment of its own (5 GB)
+	scripts/setup.sh gateway --without-images --with-train
 
 install: ## Install as systemd services on this machine (DESTDIR=… for a package)
 	DESTDIR="$(DESTDIR)" scripts/install.sh

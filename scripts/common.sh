@@ -17,6 +17,7 @@ if [ "$(id -u)" -eq 0 ]; then
   VENV=$BASE/venv
   TOOLS=$BASE/tools
   RAY=$BASE/ray
+  TRAIN=$BASE/train
   TREE=$BASE/work/swiftbot
   STATE=$BASE/setup
 else
@@ -27,6 +28,7 @@ else
   VENV=$BASE
   TOOLS=$BASE/.tools
   RAY=$BASE/.ray
+  TRAIN=$BASE/.train
   TREE=$PROJECT
   STATE=$BASE/.setup
 fi

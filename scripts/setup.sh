@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Makes this machine able to run the appliance, from nothing but git, make and Python 3.11 on Debian.
 #
-#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-ray]
+#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-ray] [--with-train]
 #
 # gateway: what a gateway and the demo need. dev: that, and the tools of `make test`. host: only the machine's part
 # (packages, user, ranges, Podman), for `make install`, which puts the program elsewhere. --with-ray: also Ray, which
-# benchmarks compare with, in an environment of its own.
+# benchmarks compare with; --with-train: also PyTorch, for `swiftbot train`; each in an environment of its own.
 # As root it sets up the service user and works for it; as a user it works in place and asks sudo for system packages
 # and id ranges only. What is there already is kept: a second run takes about a second. docs/operations.md tells more.
 set -euo pipefail
@@ -16,13 +16,15 @@ START=$(date +%s%N)
 MODE=gateway
 IMAGES=1
 WITH_RAY=
+WITH_TRAIN=
 for argument in "$@"; do
   case $argument in
     gateway | dev | host) MODE=$argument ;;
     --without-images) IMAGES= ;;
     --with-ray) WITH_RAY=1 ;;
+    --with-train) WITH_TRAIN=1 ;;
     *)
-      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-ray])" >&2
+      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-ray] [--with-train])" >&2
       exit 2
       ;;
   esac
@@ -311,17 +313,21 @@ make_environment() {
 }
 
 # Ray is for measurements alone, and larger than most of the rest: the product's own environment stays without it.
-make_ray() {
-  local want
-  want=$(digest "$PROJECT/locks/bench.txt")
-  if [ -x "$RAY/bin/ray" ] && [ "$(cat "$STATE/ray" 2>/dev/null)" = "$want" ]; then return; fi
+make_ray() { make_apart ray "$RAY" locks/bench.txt bin/ray; }
+make_train() { make_apart train "$TRAIN" locks/train.txt bin/torchrun; }
+
+# make_apart NAME FOLDER LOCK PROOF: an environment beside the program's own; PROOF is a file that it has when it is whole.
+make_apart() {
+  local name=$1 folder=$2 lock=$3 proof=$4 want
+  want=$(digest "$PROJECT/$lock")
+  if [ -x "$folder/$proof" ] && [ "$(cat "$STATE/$name" 2>/dev/null)" = "$want" ]; then return; fi
   make_tools
-  say "ray: packages of locks/bench.txt"
-  quiet "ray: $RAY" "remove $RAY and run it again" "$TOOLS/bin/uv" venv --quiet --clear --python /usr/bin/python3 "$RAY"
-  quiet "ray: packages" "see the lines above" "$TOOLS/bin/uv" pip sync --quiet --require-hashes --only-binary :all: \
-    --python "$RAY/bin/python" "$PROJECT/locks/bench.txt"
-  echo "$want" >"$STATE/ray"
-  say "ray: done"
+  say "$name: packages of $lock"
+  quiet "$name: $folder" "remove $folder and run it again" "$TOOLS/bin/uv" venv --quiet --clear --python /usr/bin/python3 "$folder"
+  quiet "$name: packages" "see the lines above" "$TOOLS/bin/uv" pip sync --quiet --require-hashes --only-binary :all: \
+    --python "$folder/bin/python" "$PROJECT/$lock"
+  echo "$want" >"$STATE/$name"
+  say "$name: done"
 }
 
 # The package itself, as a pointer to the tree ("editable"), built without network.
@@ -442,5 +448,6 @@ else
   start_api
   if [ -n "$IMAGES" ]; then build_images; fi
   if [ -n "$WITH_RAY" ]; then make_ray; fi
+  if [ -n "$WITH_TRAIN" ]; then make_train; fi
 fi
 say "ready ($MODE, user $RUN_USER)"

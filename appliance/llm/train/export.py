@@ -4,8 +4,8 @@
 
     python -m appliance.llm.train.export RUN FOLDER --precision int4
 
-The confidence is calibrated on the held-out pairs: a logistic of the log-odds of the whole answer, fitted so that of the
-answers with confidence 0.9 nine in ten are exact. The reliability curve is printed, for the model card.
+The confidence is calibrated on the held-out pairs: a logistic of the log-odds of the whole answer, fitted so that of
+the answers with confidence 0.9 nine in ten are exact. The reliability curve is printed, for the model card.
 """
 
 import argparse
@@ -24,8 +24,8 @@ from appliance.llm.language.words import words_of
 from appliance.llm.slot import Slot
 from appliance.llm.speaking import Question
 from appliance.llm.train.card import card_of, write_card
+from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.examples import Example
-from appliance.llm.train.fit import corpus_examples
 from appliance.llm.train.judge import is_exact
 from appliance.llm.train.splits import split
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens

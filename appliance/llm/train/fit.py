@@ -23,16 +23,15 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 from transformers import LlamaConfig, LlamaForCausalLM
 
-from appliance.llm import corpus
-from appliance.llm.corpus.notation import parse
 from appliance.llm.language.words import MAX_WORDS
-from appliance.llm.train.examples import Example, example_of
+from appliance.llm.train.corpus import corpus_examples
+from appliance.llm.train.examples import Example
 from appliance.llm.train.judge import judge
 from appliance.llm.train.lexicon import Lexicon
 from appliance.llm.train.splits import split
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
 from appliance.llm.train.vary import vary
-from appliance.skills.catalogue import Catalogue, load_catalogue
+from appliance.skills.catalogue import load_catalogue
 
 CONTEXT = 1024
 """Tokens of a prompt and its answer; longer examples are left out of a batch."""
@@ -94,12 +93,6 @@ class Batches(Dataset[dict[str, Any]]):
             inputs[at, :whole] = torch.tensor(prompt + answer)
             labels[at, len(prompt) : whole] = torch.tensor(answer)
         return {"input_ids": inputs, "labels": labels}
-
-
-def corpus_examples(catalogue: Catalogue) -> list[Example]:
-    """Return the examples of all hand-written pairs."""
-    files = sorted(Path(corpus.__file__).parent.glob("*.plan"))
-    return [example_of(pair, catalogue) for file in files for pair in parse(file.read_text(), name=file.name).values()]
 
 
 def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:
