@@ -212,6 +212,7 @@ class Watch:
         total: Counter[str] = Counter()
         for status in self._orders.client.plane.registry.gateways.values():
             total.update(status.refused)
+            total.update({f"searches: {what}": count for what, count in status.searches.items()})
         return total
 
     def _used(self) -> dict[str, float]:

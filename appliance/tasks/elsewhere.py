@@ -76,7 +76,12 @@ def choose(
         expected_s: how long it is expected to wait yet; None: not known.
         cold_s: what a cold start of its image takes.
     """
-    allowed = [each for each in ready if each.gateway not in avoid and (not within or each.gateway in within)]
+    unwilling = {name for name, status in gateways.items() if status.draining or status.overloaded}
+    allowed = [
+        each
+        for each in ready
+        if each.gateway not in avoid and each.gateway not in unwilling and (not within or each.gateway in within)
+    ]
     if allowed:
         # The least loaded of those that have one: load comes with the status, and is 1 where there is none.
         def load(container: ContainerInfo) -> tuple[bool, float, str, str]:
@@ -94,7 +99,7 @@ def choose(
         for name, status in gateways.items()
         if name not in avoid
         and (not within or name in within)
-        and not status.draining
+        and name not in unwilling
         and not status.pool_problem
         and status.queue == 0
         and status.containers < status.capacity
