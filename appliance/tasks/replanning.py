@@ -19,7 +19,7 @@ from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
-from appliance.tasks.replan.decide import AskDecomposer, GiveUp, decide
+from appliance.tasks.replan.decide import AskDecomposer, GiveUp, confirmed, decide
 from appliance.tasks.replan.robots import Rebinding, another_robot, robot_of
 from appliance.tasks.replan.skills import Substitution
 from appliance.tasks.replan.splice import problems, splice
@@ -101,7 +101,8 @@ class Replanning:
         if wrong:
             self._give_up(target, f"the new plan does not fit any more: {'; '.join(wrong[:3])}")
             return
-        waits = news.plan.confidence < self._around.config.replan.confirm_below
+        # Whoever confirmed a plan before it ran is asked again: this is another one.
+        waits = news.plan.confidence < self._around.config.replan.confirm_below or confirmed(keeper.record)
         keeper.take(
             keeper.transition(
                 TransitionKind.PROPOSED,

@@ -66,7 +66,18 @@ def run(ctx):
     sum(range(2_000_000))
     return {"note": ctx.params.get("note", ""), "token": time.time_ns(), "pid": os.getpid()}
 """
+LINGERS = """
+import time
+
+def run(ctx):
+    until = time.monotonic() + 90
+    while time.monotonic() < until:
+        ctx.alive()
+        time.sleep(0.1)
+    return {}
+"""
 SKILLS = {
+    "lingers": (LINGERS, "silent_s = 2"),
     "hushed": (HUSHED, "silent_s = 2"),
     "works": (WORKS, ""),
     "breaks": (BREAKS, ""),
@@ -278,6 +289,34 @@ async def test_work_that_goes_wrong_is_found_and_mended(up: Up, upstream: Upstre
     await local_fleet.down(Path(state.directory), progress=print)
     reports = [replay(path) for path in sorted(Path(state.record_dir).glob("*.mcap"))]
     assert [each.differences for report in reports for each in report.tasks] == [()] * 3
+
+
+async def test_whoever_watches_may_leave_and_the_task_goes_on(up: Up) -> None:
+    """Ctrl-C ends `swiftbot task watch` with 0; a handler that only says that it is alive is never taken for stuck."""
+    state = await up(pool=PoolConfig(floor={"base": 1}))
+    async with FleetClient(state.endpoint) as client:
+        accepted = await client.submit(plan(Subtask(id="s1", skill="lingers")))
+        await follow(client, accepted.id, until=lambda record: _runs(record, "s1"))
+        watching = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "appliance.cli", "task", "watch", accepted.id, "--json",
+            "--fleet", state.fleet, "--dir", state.directory,
+            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        assert watching.stdout is not None
+        async with asyncio.timeout(60):
+            first = json.loads(await watching.stdout.readline())
+        assert first["task"] == accepted.id
+        await asyncio.sleep(5)  # longer than the skill promises to be silent at most
+        watching.send_signal(signal.SIGINT)
+        async with asyncio.timeout(60):
+            _, said = await watching.communicate()
+        assert watching.returncode == 0, said
+        assert b"goes on" in said
+        record = await client.task(accepted.id)
+        assert [each.number for each in record.of("s1").attempts] == [1]
+        assert not record.of("s1").condition
+        await client.cancel(accepted.id)
+        assert (await end(client, accepted.id)).state is TaskState.CANCELLED
 
 
 async def test_another_robot_takes_over_from_one_that_goes_offline(up: Up) -> None:

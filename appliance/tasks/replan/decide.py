@@ -34,6 +34,14 @@ def worth_replanning(failure_code: str) -> bool:
     return failure_code != "cancelled"
 
 
+def confirmed(record: TaskRecord) -> bool:
+    """Whether a plan that came with its task is the decomposer's, which somebody looked at and confirmed.
+
+    One that was written by hand says nothing of how sure a planner is of it.
+    """
+    return record.handed_in and record.plan is not None and record.plan.confidence > 0
+
+
 def decide(
     record: TaskRecord,
     target: SubtaskRecord,
@@ -68,7 +76,7 @@ def decide(
     if isinstance(substitution, Substitution):
         return substitution
     reasons.append(substitution)
-    if record.handed_in:
+    if record.handed_in and not confirmed(record):
         reasons.append("its plan was handed in with the task and is not planned anew")
     elif not config.decompose:
         reasons.append("tasks.replan.decompose is off")

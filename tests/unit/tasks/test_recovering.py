@@ -95,6 +95,18 @@ async def test_an_unsure_plan_waits_for_an_operator(bench: Any) -> None:
     assert request.subtask == "r1ltn_1"
 
 
+async def test_whoever_confirmed_the_first_plan_is_asked_again(bench: Any) -> None:
+    """A task from the terminal UI: its plan was the decomposer's and confirmed; the new one waits, however sure."""
+    plan = replace(bench.plan_of(WORK), confidence=0.95)
+    bench.around.the_plan = plan
+    bench.around.recovery.new_plan = new_plan(Subtask(id="b", skill="work", params={"n": 9}))
+    await bench.start(bench.plane.accepted(plan=plan))
+    _, request = await bench.ordered()
+    bench.tell(request, FAILED, failure=BROKEN)
+    record = await bench.until(lambda record: record.proposal is not None)
+    assert record.proposal.waits
+
+
 async def test_an_operator_turns_a_plan_down(bench: Any) -> None:
     """The task fails with the first failure, and says who did not agree."""
     bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)

@@ -199,6 +199,16 @@ def test_the_order_of_what_is_tried() -> None:
         assert isinstance(found, GiveUp), found
 
 
+def test_a_confirmed_plan_of_the_decomposer_may_be_planned_anew() -> None:
+    """What the terminal UI hands in was made by the decomposer; what a person wrote was not."""
+    record = given_up((replace(GOTO, robot=None, skill="report", params={}),), "s1", BROKEN, handed_in=True)
+    given: dict[str, Any] = {"manifests": SKILLS, "robots": ROBOTS, "config": CONFIG}
+    assert isinstance(decide(record, record.of("s1"), **given), GiveUp)
+    assert record.plan is not None
+    sure = replace(record, plan=replace(record.plan, confidence=0.9))
+    assert isinstance(decide(sure, sure.of("s1"), **given), AskDecomposer)
+
+
 def test_a_new_plan_keeps_what_is_finished_by_what_it_is_not_by_its_id() -> None:
     """A model may number as it likes: the way that was gone is known by skill, robot and place."""
     record = given_up((GOTO, PHOTO, NOTE), "s2", BROKEN)
