@@ -8,7 +8,7 @@ import asyncio
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import structlog
 
@@ -107,6 +107,12 @@ class Scheduler:
         key = task_key(record.id)
         root = self._plane.ring.owner(key)
         ready = [each.subtask.id for each in machine.ready(record)]
+        if looked and record.group is not None:
+            # Between two looks at the fleet only the members are looked at: there may be hundreds of others.
+            members = {each.gateway: each for each in self.standings(record, record.group.members)}
+            served = frozenset[str]().union(*(each.serves for each in members.values()))
+            if not must_form(record.group, members, root=root, ready=()) and served.issuperset(ready):
+                return None
         standings = {each.gateway: each for each in self.standings(record)}
         why = must_form(record.group, standings, root=root, ready=ready)
         if not why and looked:
@@ -122,9 +128,10 @@ class Scheduler:
         )
         return None if group is record.group else group
 
-    def standings(self, record: TaskRecord) -> list[Standing]:
-        """What is known of each gateway that is there with regard to a task."""
+    def standings(self, record: TaskRecord, names: Collection[str] | None = None) -> list[Standing]:
+        """What is known of the gateways that are there with regard to a task; `names`: of these alone."""
         gateways = self.gateways()
+        holders = self._holders(gateways, record)
         wanted = [each for each in record.subtasks if not each.state.final]
         wants = {each.subtask.id: want for each in wanted if (want := self._want(each)) is not None}
         ready = [each for each in machine.ready(record) if each.subtask.id in wants] or [
@@ -133,7 +140,9 @@ class Scheduler:
         near = [holds(record, each, wants[each.subtask.id].need.volumes, gateways) for each in ready]
         found: list[Standing] = []
         for name, status in gateways.items():
-            reasons = {subtask: self._why_not(want, status, gateways, record.within) for subtask, want in wants.items()}
+            if names is not None and name not in names:
+                continue
+            reasons = {subtask: self._why_not(want, status, holders, record.within) for subtask, want in wants.items()}
             containers = tuple(self._plane.registry.containers.get(name, {}).values())
             warm = [warmth(wants[each.subtask.id].need, containers) for each in ready]
             found.append(
@@ -155,8 +164,20 @@ class Scheduler:
         need = need_of(manifest)
         return Want(subtask=target.subtask.id, skill=target.subtask.skill, need=need, image=self._image_of(need.image))
 
+    def _holders(
+        self, gateways: Mapping[str, GatewayStatus], record: TaskRecord
+    ) -> Mapping[str, frozenset[str] | None]:
+        """Who has the images of a task's skills, by their references."""
+        skills = (self._catalogue.skills.get(each.subtask.skill) for each in record.subtasks)
+        images = {self._image_of(each.image) for each in skills if each is not None} - {""}
+        return {image: image_holders(gateways, image) for image in images}
+
     def _why_not(
-        self, want: Want, status: GatewayStatus, gateways: Mapping[str, GatewayStatus], within: tuple[str, ...]
+        self,
+        want: Want,
+        status: GatewayStatus,
+        holders: Mapping[str, frozenset[str] | None],
+        within: tuple[str, ...],
     ) -> str:
         containers = self._plane.registry.containers.get(status.id, {}).values()
         return why_not(
@@ -164,7 +185,7 @@ class Scheduler:
             status,
             ready=any(want.need.image in (each.image, *each.compatible) for each in containers),
             skills=self._skills_of(status),
-            holders=image_holders(gateways, want.image) if want.image else None,
+            holders=holders.get(want.image),
             within=within,
         )
 
@@ -205,11 +226,12 @@ class Scheduler:
             raise NotFoundError(f"{self._plane.gateway} has no skill {target.subtask.skill[:80]!r}")
         gateways = self.gateways()
         members = record.group.members if record.group is not None else tuple(gateways)
+        holders = self._holders(gateways, record)
         excluded: dict[str, str] = {}
         for name, status in gateways.items():
             if name not in members:
                 excluded[name] = "is not in the task's group"
-            elif reason := self._why_not(want, status, gateways, record.within):
+            elif reason := self._why_not(want, status, holders, record.within):
                 excluded[name] = reason
         registry.asked(want.need.image)
         stale_s = {name: late_s for name in gateways if (late_s := registry.stale_s(name))}
