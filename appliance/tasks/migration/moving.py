@@ -315,6 +315,8 @@ class Moving:
         self, ask: MigrateAsk, driver: Driver, target: SubtaskRecord, request: RunRequest, reserved: Reserved
     ) -> None:
         """Migrate: have the driver write the record with the new attempt."""
+        # It may have ended while it was held; a driver whose task has ended hears nothing any more.
+        _movable(driver.record, replace(ask, attempt=target.attempt))
         if (move := self._moves.get((ask.task, ask.subtask))) is not None:
             move.written = True
         outcome: asyncio.Future[int] = asyncio.get_running_loop().create_future()

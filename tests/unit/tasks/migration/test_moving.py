@@ -82,8 +82,8 @@ class Fleet:
 @pytest.fixture
 async def fleet(bench: Any, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Fleet]:
     """A subtask that runs on gw-1, and what could be done about it."""
-    monkeypatch.setattr(module, "WRITE_S", 0.5)
-    monkeypatch.setattr(module, "START_S", 0.5)
+    monkeypatch.setattr(module, "WRITE_S", 20.0)
+    monkeypatch.setattr(module, "START_S", 20.0)
     monkeypatch.setattr(module, "DRIVER_S", 0.05)
     await bench.start()
     _, request = await bench.ordered()
@@ -215,8 +215,11 @@ async def test_an_order_that_fails_after_the_record_is_written_is_repeated_at_no
     assert last.state is TaskState.SUCCEEDED
 
 
-async def test_a_coordinator_that_dies_after_the_write_is_succeeded(fleet: Fleet) -> None:
+async def test_a_coordinator_that_dies_after_the_write_is_succeeded(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The next driver finds an attempt that its gateway does not know: it is repeated, no result of the old counts."""
+    monkeypatch.setattr(module, "START_S", 0.1)
     fleet.gates["run_leave"] = asyncio.Event()
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
     await fleet.bench.until(lambda record: record.subtasks[0].attempt == 2)
