@@ -233,7 +233,7 @@ class Dht:
             Its version, once they and this gateway agree.
         """
         others = [each for each in self._replicas(record.key) if each != self._gateway]
-        pushed = asyncio.gather(*(self._push(each, record) for each in others))
+        pushed = asyncio.gather(*(self._push(each, record, durable=asked.durable) for each in others))
         try:
             await committed
         except BaseException as error:
@@ -254,11 +254,11 @@ class Dht:
         await asyncio.gather(*(self._push(each, record) for each in others))
         return record.version
 
-    async def _push(self, gateway: str, record: Record) -> Record | None:
+    async def _push(self, gateway: str, record: Record, *, durable: bool = True) -> Record | None:
         """Have a replica store a record; returns what it holds if that is something else."""
         timeout_s = self._config.replica_timeout_s
         try:
-            ask = StoreAsk(record)
+            ask = StoreAsk(record, durable)
             answer = await self._rpc.call(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
         except UnreachableError:
             return None  # gone: its successor in the replica set takes the record when it reconciles
@@ -350,7 +350,8 @@ class Dht:
             else:
                 answer(Found(None if kept == record else kept))
 
-        self._store.change_then(record.key, partial(_settle, record, self.resolver or by_bytes), done)
+        order = partial(_settle, record, self.resolver or by_bytes)
+        self._store.change_then(record.key, order, done, durable=asked.durable)
         return True
 
     async def _on_store(self, asked: StoreAsk) -> Found:

@@ -18,10 +18,12 @@ class Found(Struct, frozen=True, omit_defaults=True):
     record: Record | None = None
 
 
-class StoreAsk(Struct, frozen=True):
+class StoreAsk(Struct, frozen=True, omit_defaults=True):
     """`dht_store`: keep this version, unless a newer one is here."""
 
     record: Record
+    durable: bool = True
+    """On the disk before the answer; otherwise the last moments may be lost with the power."""
 
 
 class Written(Struct, frozen=True):

@@ -178,13 +178,15 @@ class Store:
         key: str,
         decide: Callable[[Record | None], Record | None],
         done: Callable[[Record | None, Exception | None], None],
+        *,
+        durable: bool = True,
     ) -> None:
         """Do the same, from any thread; `done` is told on the store's thread, once it is committed.
 
         Raises:
             RefusedError: the store is closed, or too much waits for the disk.
         """
-        self._submit(_Call(partial(self._change, key, decide), done, writes=True, durable=True))
+        self._submit(_Call(partial(self._change, key, decide), done, writes=True, durable=durable))
 
     def _change(
         self, key: str, decide: Callable[[Record | None], Record | None], db: sqlite3.Connection

@@ -26,7 +26,15 @@ FAILURES = (
     PublishedFailure(0.4, 4.69, 3.23),
     PublishedFailure(0.5, 5.09, 5.10),
 )
-FAILURES_SOURCE = "Stoica et al., IEEE/ACM ToN 11(1) 2003, table II (N = 1,000, r = 20)"
+FAILURES_SOURCE = (
+    "Stoica et al., IEEE/ACM ToN 11(1) 2003, table II (N = 1,000, r = 20); written down without the paper at hand, "
+    "not compared with it"
+)
+FAILURES_THEOREM = (
+    "What the same paper proves: with successor lists of length proportional to log N in a ring that was stable, and "
+    "every node failing with probability 1/2, a lookup ends with high probability at the closest living successor, "
+    "in expected time O(log N)"
+)
 HOPS_SOURCE = "Stoica et al., SIGCOMM 2001 and ToN 11(1) 2003, simulation of path length: mean about ½·log2 N"
 
 

@@ -65,6 +65,7 @@ def run(sizes: Sequence[int], *, lookups: int, seconds: float, seed: int, progre
         "failures": failed,
         "failures_published": {
             "source": chord.FAILURES_SOURCE,
+            "theorem": chord.FAILURES_THEOREM,
             **{
                 f"{each.share:.0%}": {"hops": each.mean_hops, "timeouts": each.mean_timeouts} for each in chord.FAILURES
             },
