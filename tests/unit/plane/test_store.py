@@ -213,3 +213,58 @@ async def test_a_closed_store_refuses(tmp_path: Path) -> None:
     store = await Store.open(tmp_path / "s.sqlite")
     assert len(await store.scan("")) == 300
     await store.close()
+
+
+async def test_a_decision_is_known_before_it_is_committed(tmp_path: Path) -> None:
+    """`change_soon` tells the decision and then its commit; one that fails fails both, and leaves nothing behind."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    decided, committed = store.change_soon("k", lambda _: _record("k"))
+    assert await decided == _record("k")
+    assert await committed == _record("k")
+    assert store.look("k") == (True, _record("k"))
+
+    def refuse(_: Record | None) -> Record:
+        raise ConflictError("moved on")
+
+    decided, committed = store.change_soon("k", refuse)
+    with pytest.raises(ConflictError):
+        await decided
+    assert await store.record("k") == _record("k")
+    await store.close()
+    with pytest.raises(RefusedError):
+        store.change_soon("k", lambda _: _record("k"))
+
+
+async def test_any_thread_may_change_a_record(tmp_path: Path) -> None:
+    """`change_then` from other threads: each is told on the store's thread once its change is committed and shown."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    loop = asyncio.get_running_loop()
+    told: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
+
+    def change(key: str) -> None:
+        def done(record: Record | None, error: Exception | None) -> None:
+            shown = error is None and store.look(key) == (True, record)
+            loop.call_soon_threadsafe(told.put_nowait, (key, shown))
+            raise RuntimeError("who waits may fail")
+
+        store.change_then(key, lambda _: _record(key), done)
+
+    await asyncio.gather(*(asyncio.to_thread(change, f"k{number}") for number in range(20)))
+    assert sorted([await told.get() for _ in range(20)]) == sorted((f"k{number}", True) for number in range(20))
+    assert await store.record("none") is None
+    await store.close()
+
+
+async def test_what_is_not_in_memory_is_read_from_the_file(tmp_path: Path) -> None:
+    """After a restart records are found in the file, and are in memory from then on; those dropped are gone at once."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    await store.change("k", lambda _: _record("k"))
+    await store.close()
+    store = await Store.open(tmp_path / "s.sqlite")
+    assert store.look("k") == (False, None)
+    assert store.look("none") == (True, None)
+    assert await store.record("k") == _record("k")
+    assert store.look("k") == (True, _record("k"))
+    await store.forget(_record("k"))
+    assert store.look("k") == (True, None)
+    await store.close()
