@@ -95,6 +95,11 @@ class Driver:
         return self._keeper.record
 
     @property
+    def told(self) -> TaskRecord:
+        """The task as it was written last."""
+        return self._keeper.told
+
+    @property
     def elapsed_s(self) -> float:
         """Seconds since the task was accepted."""
         return self._keeper.elapsed_s

@@ -37,6 +37,8 @@ class Keeper:
     ) -> None:
         self._plane = plane
         self.record = record
+        self.told = record
+        """The record as it was written and published last: what others may be told, since a successor knows it too."""
         self._version = version
         self._on_change = on_change
         self._pending: list[Transition] = []
@@ -114,6 +116,7 @@ class Keeper:
             self.on_published(transition)
         self._pending.clear()
         self._plane.session.put(self._plane.keys.task(self.record.id), with_unknown(self.record, self.unknown))
+        self.told = self.record
         self._on_change(self.record)
 
     def take(self, transition: Transition, *, durable: bool = True) -> bool:

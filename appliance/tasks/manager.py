@@ -492,7 +492,7 @@ class TaskManager:
     async def task(self, ask: TaskAsk) -> TaskRecord:
         """Return a task's record; NotFoundError when there is none."""
         if driver := self._drivers.get(ask.id):
-            return driver.record
+            return driver.told
         stored = await self.plane.dht.read(task_key(check_name(ask.id, "task")))
         if stored is None or stored.deleted:
             raise NotFoundError(f"there is no task {ask.id}", remedy="see `swiftbot task list`")

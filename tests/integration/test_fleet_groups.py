@@ -18,7 +18,19 @@ from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.local_fleet import FleetState, Order
-from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.model import (
+    Need,
+    Plan,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
+    Subtask,
+    SubtaskState,
+    TaskRecord,
+    TaskRequest,
+    TaskState,
+)
 from appliance.pool.settings import PoolConfig
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(400)]
@@ -110,7 +122,7 @@ async def test_when_the_root_is_killed_its_successor_leads_and_nothing_runs_twic
     async with FleetClient(fleet.endpoint) as client:
         accepted = await client.submit(nap(1.5, subtasks=4, priority=7, submitter="ann", deadline_s=180.0))
         before = await follow(
-            client, accepted.id, lambda record: any(each.state is SubtaskState.SUCCEEDED for each in record.subtasks)
+            client, accepted.id, lambda record: bool(record.subtasks) and record.of("s2").state is SubtaskState.RUNNING
         )
         assert before.group is not None
         assert set(before.group.members) == {"gw-1", "gw-2", "gw-3"}
@@ -165,3 +177,55 @@ async def test_a_flood_waits_its_turn_and_a_deadline_ends_what_is_too_late(up: U
     assert order.index(other.id) < order.index(last)
     wrong = await asyncio.to_thread(cli, fleet, "submit", "nap", "--priority", "12")
     assert wrong.returncode != 0
+
+
+async def test_a_run_that_waits_goes_where_there_is_room_first_and_begins_once(up: Up) -> None:
+    """Both gateways are busy; the one that was not asked is free first: the waiting run is passed on to it, once."""
+    fleet = await up(gateways=2, pool=PoolConfig(floor={"base": 1}, capacity=1))
+    heard: asyncio.Queue[RunEvent] = asyncio.Queue()
+    async with FleetClient(fleet.endpoint) as client:
+        await client.gateway()
+        client.on_run("t-wait", heard)
+        await asyncio.sleep(0.5)
+
+        async def order(gateway: str, name: str, seconds: float, hops: int = 0) -> RunAccepted:
+            request = RunRequest(
+                task="t-wait", subtask=name, attempt=1, skill="nap", need=Need(image="base"), hops=hops,
+                params={"for_s": seconds},
+            )  # fmt: skip
+            return await client.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=20.0)
+
+        # Passed on already, so that each stays where it is ordered.
+        await order("gw-1", "long", 30.0, hops=1)
+        await order("gw-2", "short", 3.0, hops=1)
+        async with asyncio.timeout(30):
+            while not all(client.plane.registry.gateways[each].running for each in ("gw-1", "gw-2")):
+                await asyncio.sleep(0.05)
+        accepted = await order("gw-1", "waits", 0.1)
+        assert accepted.gateway == "gw-1"
+        told: list[RunEvent] = []
+        async with asyncio.timeout(60):
+            while not any(each.subtask == "waits" and each.kind is RunEventKind.SUCCEEDED for each in told):
+                told.append(await heard.get())
+        mine = [each for each in told if each.subtask == "waits"]
+        assert [each.gateway for each in mine if each.kind is RunEventKind.STARTED] == ["gw-2"]
+        assert not any(each.subtask == "long" and each.kind is RunEventKind.SUCCEEDED for each in told)
+        moved = [each for each in mine if each.choice is not None]
+        assert len(moved) == 1
+        print(moved[0].note)
+        async with asyncio.timeout(30):
+            while not client.plane.registry.gateways["gw-1"].searches.get("moved"):
+                await asyncio.sleep(0.1)
+
+
+async def test_a_task_stays_within_the_gateways_that_its_submitter_allows(up: Up) -> None:
+    """Whoever coordinates it: no subtask runs elsewhere, and `task why` says why the others are no candidates."""
+    fleet = await up(gateways=3, pool=PoolConfig(floor={"base": 1}))
+    async with FleetClient(fleet.endpoint) as client:
+        for _ in range(4):
+            accepted = await client.submit(nap(0.2, subtasks=2, group=("gw-2",)))
+            ended = await follow(client, accepted.id, lambda record: record.state.final)
+            assert ended.state is TaskState.SUCCEEDED, ended.failure
+            assert {each.gateway for each in ended.subtasks} == {"gw-2"}
+            assert ended.group is not None
+            assert set(ended.group.members) == {"gw-2", ended.coordinator}
