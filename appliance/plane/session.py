@@ -34,6 +34,9 @@ T = TypeVar("T")
 Answer = Callable[[bytes | None, SwiftbotError | None], None]
 """Answers one query, from any thread."""
 
+WRONG_DOOR = "the question is not for this"
+_AFTER_ANSWER_S = 0.05
+"""After a question at the wrong door was answered so, before the links are made anew."""
 _CLOSE_S = 2.0
 """How long a closing session keeps sending what waits."""
 
@@ -232,8 +235,8 @@ class Session:
             meant = query.attachment.to_bytes() if query.attachment is not None else b""
             direct, meant = meant.startswith(link.MARK), meant.removeprefix(link.MARK)
             if meant and "*" not in expr and meant != expr.encode():
-                error = UnreachableError(f"{expr}: the question is not for this", remedy="ask again in a moment")
-                begin = partial(self._refuse_query, f"misrouted {name}", query, expr, error)
+                error = UnreachableError(f"{expr}: {WRONG_DOOR}", remedy="ask again in a moment")
+                begin = partial(self._misrouted, name, query, expr, error)
                 size = 0
             elif size > limit:
                 error = PayloadError(f"{key}: {size:,} bytes", remedy=f"at most {limit:,}")
@@ -295,6 +298,15 @@ class Session:
             else:
                 self._send(key, partial(link.reply, query, expr, reply, error, bulk=bulk), size, bulk=bulk)
 
+    def _misrouted(self, name: str, query: zenoh.Query, expr: str, error: SwiftbotError) -> None:
+        """Refuse a question for another key, and make the links anew over which it came: they are mixed up for good."""
+        self._refuse_query(f"misrouted {name}", query, expr, error)
+        self._loop.call_later(_AFTER_ANSWER_S, self._reset_links)
+
+    def _reset_links(self) -> None:
+        if not self._closed and (broken := self._sockets.reset()):
+            log.warning("links are made anew, since questions arrived at wrong doors", links=broken)
+
     def _refuse_query(self, what: str, query: zenoh.Query, expr: str, error: SwiftbotError) -> None:
         self.refuse(what, key=str(query.key_expr), reason=str(error))
         self._send(expr, partial(link.reply, query, expr, None, error), 0)
@@ -321,6 +333,9 @@ class Session:
         def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
             if not answer.done():
                 if error is not None:
+                    if WRONG_DOOR in str(error):
+                        # Mixed up may be the link from here, or one further on: both ends make theirs anew.
+                        self._loop.call_later(_AFTER_ANSWER_S, self._reset_links)
                     answer.set_exception(error)
                 elif data is not None:
                     answer.set_result(data)

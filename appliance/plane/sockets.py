@@ -8,13 +8,18 @@ gives up after the lease, when Zenoh takes the other side for dead as well.
 """
 
 import asyncio
+import contextlib
 import os
 import socket
 import stat
+import time
 
 EVERY_S = 0.5
 """How often new sockets are looked for, half a lease: a link that hangs at once is let go before it is missed. A look
 takes 0.1 to 0.3 ms."""
+
+CALM_S = 10.0
+"""Least time between two resets: where one does not help, a second at once would only do harm."""
 
 
 class SocketWatch:
@@ -25,6 +30,7 @@ class SocketWatch:
         self._known: dict[int, int] = {}
         """Descriptor -> inode of the sockets that have been looked at."""
         self._task: asyncio.Task[None] | None = None
+        self._reset_at = -CALM_S
 
     def start(self) -> None:
         """Begin to look; also at listening sockets, from which accepted ones inherit it."""
@@ -67,6 +73,25 @@ class SocketWatch:
             except OSError:
                 return False
         return True
+
+    def reset(self) -> int:
+        """Break every TCP connection of this process, so that both ends forget what they knew; returns how many.
+
+        Zenoh makes its links anew at once. Other connections (to a language model, to a vehicle) break too and are
+        made anew by whoever uses them: so this is for links that are known to be mixed up, and at most each `CALM_S`.
+        """
+        now = time.monotonic()
+        if now < self._reset_at + CALM_S:
+            return 0
+        self._reset_at = now
+        broken = 0
+        for number in self._known:
+            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as handle:
+                if handle.family in (socket.AF_INET, socket.AF_INET6) and handle.type == socket.SOCK_STREAM:
+                    handle.getpeername()  # a listening socket has none, and is left alone
+                    handle.shutdown(socket.SHUT_RDWR)
+                    broken += 1
+        return broken
 
     def close(self) -> None:
         """Look no more."""

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.bench.chaos.run import Options, run
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(600)]
 
 
 async def test_nothing_is_lost_or_doubled_while_gateways_are_killed(built: None, tmp_path: Path) -> None:
