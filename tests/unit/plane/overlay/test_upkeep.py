@@ -50,7 +50,8 @@ def test_failures_heal(size: int, share: float, seed: int) -> None:
     fleet = Fleet(bound=24, seed=seed).settled(f"gw-{n}" for n in range(size))
     for name in fleet.rng.sample(sorted(fleet.members), int(share * size)):
         del fleet.members[name]
-    fleet.rounds(40)
+    # Whom to meet is drawn by lot: mostly whole after 30 rounds, of 150 fleets the last after 45, once seen after 50.
+    fleet.rounds(100)
     check_neighbours(fleet)
     check_closed(fleet)
     for _ in range(20):
