@@ -150,7 +150,7 @@ async def test_a_flood_waits_its_turn_and_a_deadline_ends_what_is_too_late(up: U
     fleet = await up(gateways=1, pool=PoolConfig(floor={"base": 2}, capacity=2))
     async with FleetClient(fleet.endpoint) as client:
         flood = [await client.submit(nap(1.0, submitter="flood")) for _ in range(16)]
-        late = await client.submit(nap(1.0, submitter="flood", deadline_s=2.0))
+        late = await client.submit(nap(20.0, submitter="flood", deadline_s=2.0))
         other = await client.submit(nap(1.0, submitter="other"))
         urgent = await client.submit(nap(1.0, submitter="flood", priority=9))
         asked = await asyncio.to_thread(cli, fleet, "task", "why", flood[-1].id, "--json")
