@@ -106,16 +106,25 @@ class FleetClient:
         """Any gateway that is present; UnreachableError when there is none."""
         return await self.plane.any_gateway()
 
-    async def _ask(self, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0) -> R:
-        """Ask any gateway, and another one when it dies meanwhile: every verb used here may be repeated."""
-        give_up = time.monotonic() + PATIENCE_S
+    async def _ask(
+        self, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0, patience_s: float = PATIENCE_S
+    ) -> R:
+        """Ask any gateway, and another one when it is gone or silent: every verb used here may be repeated."""
+        give_up = time.monotonic() + patience_s
+        silent: set[str] = set()
         while True:
+            gateway = await self.plane.any_gateway(avoid=silent)
             try:
-                return await self.plane.rpc.call(await self.gateway(), verb, request, reply, timeout_s=timeout_s)
+                return await self.plane.rpc.call(gateway, verb, request, reply, timeout_s=timeout_s)
             except UnreachableError:
                 if time.monotonic() > give_up:
                     raise
                 await asyncio.sleep(0.1)
+            except DeadlineError:
+                # It may be frozen, which is only noticed when its lease ends.
+                silent.add(gateway)
+                if time.monotonic() > give_up or silent >= self.plane.members():
+                    raise
 
     async def plan(self, instruction: str) -> PlanAnswer:
         """Decompose, run nothing."""
@@ -125,7 +134,7 @@ class FleetClient:
         """Hand in a task; durable when this returns. It gets its id here, so that asking twice is one task."""
         if not request.id:
             request = replace(request, id=f"t-{uuid.uuid4().hex[:10]}")
-        return await self._ask("submit", request, TaskRecord, timeout_s=10.0)
+        return await self._ask("submit", request, TaskRecord, timeout_s=6.0, patience_s=15.0)
 
     async def task(self, task: str) -> TaskRecord:
         """One task's record."""

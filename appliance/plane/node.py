@@ -5,7 +5,7 @@ import contextlib
 import math
 import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from pathlib import Path
 
 import structlog
@@ -300,8 +300,11 @@ class PlaneClient:
         """Ids of the gateways that are there."""
         return self._membership.members
 
-    async def any_gateway(self, *, timeout_s: float = 3.0) -> str:
-        """Return a gateway that is there, the same one while it is; UnreachableError when there is none."""
+    async def any_gateway(self, *, timeout_s: float = 3.0, avoid: Set[str] = frozenset()) -> str:
+        """Return a gateway that is there, the same one while it is; UnreachableError when there is none.
+
+        One to `avoid` is returned only when there is no other.
+        """
         until = asyncio.get_running_loop().time() + timeout_s
         while not self.members():
             self._came.clear()
@@ -313,8 +316,9 @@ class PlaneClient:
                     f"no gateway of fleet {self.keys.fleet} is there",
                     remedy=f"is the fleet name right, and is it up? asked at {', '.join(self.config.connect)}",
                 ) from None
-        if self._gateway not in self.members():
-            self._gateway = random.choice(sorted(self.members()))  # noqa: S311 - spreads load, protects nothing
+        if self._gateway not in self.members() or self._gateway in avoid:
+            others = sorted(self.members() - avoid) or sorted(self.members())
+            self._gateway = random.choice(others)  # noqa: S311 - spreads load, protects nothing
         return self._gateway
 
     async def close(self) -> None:
