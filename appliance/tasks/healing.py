@@ -140,8 +140,13 @@ def heal(record: TaskRecord) -> Healing | None:
 
 
 def _same(own: SubtaskRecord, run: LostRun) -> bool:
-    """Whether a run of the other version is one of this version too."""
-    return any(each.number == run.attempt and each.gateway == run.gateway for each in own.attempts)
+    """Whether a run of the other version is one of this version too.
+
+    Not one that was taken for lost and repeated here while it went on, or succeeded, on the other side.
+    """
+    known = any(each.number == run.attempt and each.gateway == run.gateway for each in own.attempts)
+    went_on = run.state in _ACTIVE or run.state is SubtaskState.SUCCEEDED
+    return known and not (went_on and run.attempt < own.attempt)
 
 
 def _became(run: LostRun) -> str:

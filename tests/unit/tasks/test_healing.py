@@ -75,6 +75,19 @@ def test_nothing_doubled_is_nothing_to_tell(plane: Any) -> None:
     assert (healing.ends, healing.notes) == ((), ())
 
 
+def test_a_run_taken_for_lost_that_went_on_is_doubled(plane: Any) -> None:
+    """What one side repeated since it saw the gateway gone was still running there: it is ended, and told."""
+    record = record_of(plane, split(lost(1, "gw-1")), attempt=2)
+    healing = heal(record)
+    assert healing is not None
+    assert [(each.attempt, each.gateway) for each in healing.ends] == [(1, "gw-1")]
+    (note,) = healing.notes
+    assert "doubled: s1 (attempt 1 on gw-1: ended now)" in note
+    failed = heal(record_of(plane, split(lost(1, "gw-1", SubtaskState.FAILED)), attempt=2))
+    assert failed is not None
+    assert (failed.ends, failed.notes) == ((), ())
+
+
 def test_a_run_whose_robot_has_heard_a_later_attempt_is_repeated(plane: Any) -> None:
     """The robot would refuse it from now on; one without a robot goes on."""
     for robot, expected in (("r1", ("s1",)), (None, ())):
