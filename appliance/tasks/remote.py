@@ -2,7 +2,8 @@
 
 What the registry knows comes first: gateways push what changes, so a container that it knows to be ready, of a gateway
 that was heard of lately, is as good as an answer and costs nothing. Only when it knows of none that can be had are the
-k successors of hash(image) asked, and of those the ones of which nothing was heard lately; each answers with the ready
+k successors of hash(image) asked, and of those the ones of which nothing was heard lately, or to which runs were just
+sent, which may be over; each answers with the ready
 containers it knows of, its own and those it has heard of. What selection must know beside them comes from here too:
 the measured round trip to each gateway (a moving average), what moving bytes costs, and where the newest state of a
 volume is. A gateway whose offers turn out to be nothing, several times in a row, is left out for a while: it is out of
@@ -106,7 +107,7 @@ class RemoteContainers:
         self._plane.registry.asked(need.image)
         near = [each for each in self._plane.ring.successors(f"image/{need.image}", self._successors) if each != here]
         found = {(each.gateway, each.id): each for each in self._known(need)}
-        asked = [] if self.ready(need) else [each for each in near if not self._is_fresh(each)]
+        asked = [] if self.ready(need) else [each for each in near if not self._is_fresh(each) or self._sent_to(each)]
         self.searches["saved"] += len(near) - len(asked)
         self.searches["asked"] += len(asked)
         taken = {(each.gateway, each.id) for each in self._promised_ones(found.values())}
@@ -114,6 +115,8 @@ class RemoteContainers:
         for gateway, containers in zip(asked, answers, strict=True):
             if containers is None:
                 continue
+            # Whoever answers has counted in what was sent to it: short runs are over before anything was told.
+            taken = {key for key in taken if key[0] != gateway}
             # What a gateway says of its own containers is newer than what was heard of them.
             own = {each.id for each in containers if each.gateway == gateway}
             stale = [
@@ -170,6 +173,11 @@ class RemoteContainers:
             held.sort(key=lambda each: each.id)
             found += held[: sum(until > now for until in self._promised[gateway])]
         return found
+
+    def _sent_to(self, gateway: str) -> bool:
+        """Whether a run was sent to it so lately that it has not told of it yet."""
+        now = time.monotonic()
+        return any(until > now for until in self._promised.get(gateway, ()))
 
     def promise(self, gateway: str) -> None:
         """Note that a run is being sent to a gateway: one of its ready containers is spoken for."""

@@ -148,3 +148,15 @@ async def test_a_container_that_a_run_was_just_sent_to_is_not_offered_to_the_nex
     assert remote.ready(NEED) == []
     assert set(await found(remote)) == {"b"}
     assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-2"]
+
+
+async def test_short_runs_one_after_the_other_find_the_same_container(remote: RemoteContainers, plane: Any) -> None:
+    """Where a run was just sent to is asked when nobody else has one: the run may be over, and its word counts."""
+    know(plane, container("gw-2", "a"))
+    answers(plane, gw_2=(container("gw-2", "a"),), gw_3=())
+    plane.registry.ages = {"gw-2": 0.1, "gw-3": 0.1}
+    for _ in range(3):
+        remote.promise("gw-2")
+        assert remote.ready(NEED) == []
+        assert await found(remote) == {"a": READY}
+    assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-2"] * 3
