@@ -231,6 +231,14 @@ class Guide:
             found.append("@")
         return found
 
+    def _begin_item(self) -> list[str]:
+        """Return the symbols with which another item of a list may begin, whatever the last one was."""
+        kept = self._by_id, self._pieces, self._said
+        self._by_id, self._pieces, self._said = False, 0, ""
+        found = self.begin_value()
+        self._by_id, self._pieces, self._said = kept
+        return found
+
     def _take_value(self, symbol: str) -> None:
         if symbol == "[":
             self._listed = 0
@@ -268,8 +276,7 @@ class Guide:
         if not complete and found:
             return found
         if self._listed >= 0:
-            more = self.begin_value() if self._listed < MAX_ITEMS else []
-            return [*found, "]", *more]
+            return [*found, "]", *(self._begin_item() if self._listed < MAX_ITEMS else [])]
         found += [f"{name}:" for name in self._left if self._value_possible(name)]
         if not any(self._left.values()):
             found += ["<"] if self._number > 1 else []
