@@ -233,10 +233,10 @@ class Guide:
 
     def _begin_item(self) -> list[str]:
         """Return the symbols with which another item of a list may begin, whatever the last one was."""
-        kept = self._by_id, self._pieces, self._said
+        by_id, pieces, said = self._by_id, self._pieces, self._said
         self._by_id, self._pieces, self._said = False, 0, ""
         found = self.begin_value()
-        self._by_id, self._pieces, self._said = kept
+        self._by_id, self._pieces, self._said = by_id, pieces, said
         return found
 
     def _take_value(self, symbol: str) -> None:
