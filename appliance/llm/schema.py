@@ -19,7 +19,7 @@ from msgspec import Struct, field
 
 from appliance.errors import PlanError
 from appliance.llm.validate import MAX_SUBTASKS
-from appliance.model import Plan, RobotInfo, Subtask, Tier
+from appliance.model import Plan, RobotInfo, Site, Subtask, Tier
 from appliance.skills.catalogue import Catalogue, Param, SkillManifest
 
 GRAMMAR_SUBTASKS = 32
@@ -83,12 +83,21 @@ def _param_schema(param: Param) -> dict[str, Any]:
 # --- grammar for the slot -------------------------------------------------------------------------------------------
 
 
-def robot_names(robots: Sequence[RobotInfo] | None, instruction: str) -> tuple[str, ...] | None:
-    """Return the names a plan may use, None when any may be used: the roster, any, and what looks like a name."""
+def robot_names(
+    robots: Sequence[RobotInfo] | None, instruction: str, site: Site | None = None
+) -> tuple[str, ...] | None:
+    """Return the names a plan may use, None when any may be used: the roster, any, and what looks like a name.
+
+    Places of the site are none: with the same names the grammar is the same, and the model's warm prefix is used again.
+    """
     if robots is None:
         return None
     found = [robot.id for robot in robots]
-    found += [match[0].lower().replace(" ", "_") for match in _NAME_LIKE.finditer(instruction)]
+    found += [
+        match[0].lower().replace(" ", "_")
+        for match in _NAME_LIKE.finditer(instruction)
+        if site is None or site.find(match[0]) is None
+    ]
     return tuple(dict.fromkeys([*found, "any", *(f"any{index + 1}" for index in range(min(_ANY, len(robots))))]))
 
 

@@ -4,15 +4,18 @@ They stand apart from the cascade so that whoever only passes them on (the RPC v
 configuration file) imports nothing that plans.
 """
 
+import re
 from pathlib import Path
 
 from msgspec import Struct
 
 from appliance.errors import ConfigError
 from appliance.llm.so_far import SoFar
-from appliance.model import Plan, RobotInfo, Site
+from appliance.model import Plan, RobotInfo, Site, TierAttempt
 
-KNOWN_TIERS = ("local", "upstream", "rules")
+__all__ = ["KNOWN_TIERS", "LlmConfig", "PlanContext", "PlanOutcome", "TierAttempt"]
+
+KNOWN_TIERS = ("local", "peer", "upstream", "rules")
 """Tiers that can be named in the configuration."""
 
 
@@ -20,11 +23,19 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which planners are asked, in which order, for how long, and how sure they must be."""
 
     tiers: tuple[str, ...] = KNOWN_TIERS
-    """Order of asking: cheapest model first, then the larger one, and the rules when no model can answer. A tier
-    that is not configured (no folder, no URL) is left out."""
+    """Order of asking: cheapest model first, then that of another gateway, then the larger one, and the rules when no
+    model can answer. A tier that is not configured (no folder, no URL) or that nobody has (`peer`) is left out."""
+    cache: int = 512
+    """Plans kept of tasks that succeeded; the same instruction for the same fleet gets the same plan again. 0: none."""
+    at_once: int = 4
+    """Instructions planned at the same time; the local model answers one after the other in any case."""
+    waiting: int = 64
+    """Instructions that may wait for that; more are refused with the time after which to ask again. At a quarter of a
+    second each, 64 are gone in the seconds that a person waits."""
 
-    local_model: str = ""
-    """Folder of an onnxruntime-genai model; empty: this gateway has no local tier."""
+    local_model: str = "embedded"
+    """`embedded`: the planner that comes with the program; else the folder of an onnxruntime-genai model. Empty: this
+    gateway has no local tier."""
     local_deadline_s: float = 20.0
     """A small model on two cores takes a second or two for a long plan; beyond this something is wrong."""
     local_start_s: float = 120.0
@@ -35,15 +46,23 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Longer instructions go straight to the next tier: small models lose track in long ones."""
     local_max_tokens: int = 8192
     """Bound of prompt and answer together; the catalogue takes some 2,500. The model's context bounds it too."""
+    local_queue: int = 16
+    """Instructions that may wait for the local model; beyond it the next tier is asked at once."""
     local_threads: int = 0
     """Threads of the slot; 0: as the model's configuration says. Two help prefill, one is as good for decoding."""
+
+    peer_deadline_s: float = 8.0
+    """A gateway that has a model answers in a second or two; then another is asked, and after that the next tier."""
+    peer_tries: int = 2
+    """Gateways asked for one instruction."""
 
     upstream_url: str = ""
     """Base URL of an OpenAI-compatible server, such as `http://server:8000/v1`; empty: no upstream tier."""
     upstream_model: str = ""
     """Name of the model there."""
     upstream_key_file: str = ""
-    """File that holds the API key; a file, so that the key is in no process list and no configuration dump."""
+    """File that holds the API key; a file, so that the key is in no process list and no configuration dump. Empty: the
+    systemd credential `swiftbot-upstream-key` of the service, else the environment's `SWIFTBOT_UPSTREAM_KEY`."""
     upstream_deadline_s: float = 30.0
     """One plan, retries and repair apart; hosted models answer in 1-5 s (paper: 1.28 s)."""
     upstream_retries: int = 1
@@ -52,14 +71,35 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A server that gives no log-probabilities counts as 0.9 sure of a valid plan."""
     upstream_max_tokens: int = 4096
     """Longest answer asked for."""
+    upstream_budget: float = 0.0
+    """What the server may cost a day, in the currency of the prices; when it is spent the next tier is asked. 0: no
+    bound."""
+    upstream_requests: int = 0
+    """Requests a day; 0: no bound."""
+    upstream_price_in: float = 0.0
+    """Price of a million prompt tokens."""
+    upstream_price_out: float = 0.0
+    """Price of a million answer tokens."""
+    upstream_never: tuple[str, ...] = ()
+    """Regular expressions: an instruction in which one is found never leaves this machine."""
+    upstream_never_robots: tuple[str, ...] = ()
+    """Shell patterns of robot ids: an instruction that names one never leaves this machine, and no server is told of
+    them."""
+    upstream_private_tag: str = "#private"
+    """A word with which whoever gives an order keeps it on this machine. Empty: there is none."""
+    upstream_open_s: float = 15.0
+    """After three failures in a row the server is left alone for so long, twice as long each time after, up to ten
+    minutes: offline is normal, and must not cost each instruction a deadline."""
 
     rules_deadline_s: float = 5.0
     """The parser needs milliseconds; the bound is for hostile text."""
     rules_min_confidence: float = 0.8
     """Share of the instruction the parser must have understood: half an instruction carried out is a wrong one."""
 
-    floor_confidence: float = 0.3
-    """A valid plan that no tier was sure enough of is still taken, when nothing better came, down to this."""
+    floor_confidence: float = 0.1
+    """A valid plan that no tier was sure enough of is still taken, when nothing better came, down to this; below
+    `safety.confirm_below` it waits for an operator, to whom a draft is more use than nothing. Of the embedded planner's
+    plans with 0.1 to 0.3 a fifth is right, of those below one in fifty."""
     repair: bool = True
     """Ask a model once more, with the validator's problems, when its plan is not valid."""
     require_implemented: bool = True
@@ -67,27 +107,52 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def check(self) -> None:
         """Check what types cannot tell; ConfigError names the key."""
-        for name in self.tiers:
-            if name not in KNOWN_TIERS:
-                raise ConfigError(f"llm.tiers: no tier {name!r}", remedy=f"use {', '.join(KNOWN_TIERS)}")
-        if len(set(self.tiers)) != len(self.tiers) or not self.tiers:
-            raise ConfigError("llm.tiers: each tier once, at least one", remedy=f"use {', '.join(KNOWN_TIERS)}")
-        for key in ("local_deadline_s", "local_start_s", "upstream_deadline_s", "rules_deadline_s"):
-            if not 0 < getattr(self, key) <= 3600:
-                raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give seconds between 0 and 3600")
-        for key in ("local_min_confidence", "upstream_min_confidence", "rules_min_confidence", "floor_confidence"):
-            if not 0 <= getattr(self, key) <= 1:
-                raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give a number from 0 to 1")
-        if not 0 <= self.upstream_retries <= 5:
-            raise ConfigError(f"llm.upstream_retries: {self.upstream_retries}", remedy="give 0 to 5")
-        if not 256 <= self.local_max_tokens <= 65536 or not 64 <= self.upstream_max_tokens <= 65536:
-            raise ConfigError("llm: local_max_tokens or upstream_max_tokens", remedy="give 256 to 65536 tokens")
+        self._check_tiers()
+        self._check_bounds()
         if self.upstream_url and not self.upstream_url.startswith(("http://", "https://")):
             raise ConfigError(f"llm.upstream_url: {self.upstream_url!r}", remedy="start it with http:// or https://")
         if self.upstream_url and not self.upstream_model:
             raise ConfigError("llm.upstream_model is missing", remedy="name the model that upstream_url serves")
         if self.upstream_key_file and not Path(self.upstream_key_file).is_file():
             raise ConfigError(f"llm.upstream_key_file: no file {self.upstream_key_file}", remedy="write the key to it")
+
+    def _check_tiers(self) -> None:
+        for name in self.tiers:
+            if name not in KNOWN_TIERS:
+                raise ConfigError(f"llm.tiers: no tier {name!r}", remedy=f"use {', '.join(KNOWN_TIERS)}")
+        if len(set(self.tiers)) != len(self.tiers) or not self.tiers:
+            raise ConfigError("llm.tiers: each tier once, at least one", remedy=f"use {', '.join(KNOWN_TIERS)}")
+
+    def _check_bounds(self) -> None:
+        for key in (
+            *("local_deadline_s", "local_start_s", "peer_deadline_s"),
+            *("upstream_deadline_s", "upstream_open_s", "rules_deadline_s"),
+        ):
+            if not 0 < getattr(self, key) <= 3600:
+                raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give seconds between 0 and 3600")
+        for key in ("local_min_confidence", "upstream_min_confidence", "rules_min_confidence", "floor_confidence"):
+            if not 0 <= getattr(self, key) <= 1:
+                raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give a number from 0 to 1")
+        for key, low, high in (
+            *(("cache", 0, 100_000), ("at_once", 1, 64), ("waiting", 0, 10_000)),
+            *(("local_queue", 1, 10_000), ("peer_tries", 1, 8)),
+        ):
+            if not low <= getattr(self, key) <= high:
+                raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy=f"give {low} to {high:,}")
+        for key in ("upstream_budget", "upstream_requests", "upstream_price_in", "upstream_price_out"):
+            if not 0 <= getattr(self, key) < 1e9:
+                raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give a number from 0 on")
+        if self.upstream_budget and not (self.upstream_price_in or self.upstream_price_out):
+            raise ConfigError("llm.upstream_budget without prices", remedy="set llm.upstream_price_in and _out")
+        for each in self.upstream_never:
+            try:
+                re.compile(each)
+            except re.error as error:
+                raise ConfigError(f"llm.upstream_never: {each!r}: {error}", remedy="see Python's `re`") from error
+        if not 0 <= self.upstream_retries <= 5:
+            raise ConfigError(f"llm.upstream_retries: {self.upstream_retries}", remedy="give 0 to 5")
+        if not 256 <= self.local_max_tokens <= 65536 or not 64 <= self.upstream_max_tokens <= 65536:
+            raise ConfigError("llm: local_max_tokens or upstream_max_tokens", remedy="give 256 to 65536 tokens")
 
 
 class PlanContext(Struct, frozen=True, kw_only=True):
@@ -100,17 +165,11 @@ class PlanContext(Struct, frozen=True, kw_only=True):
     so_far: SoFar | None = None
     """What has become of an earlier plan for it; with it the rest is to be planned anew."""
     private: bool = False
-    """The text must not leave this machine: the upstream tier is not asked."""
-
-
-class TierAttempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What one tier made of an instruction; `problems` says why its plan was not taken."""
-
-    tier: str
-    ok: bool
-    confidence: float = 0.0
-    latency_ms: float = 0.0
-    problems: tuple[str, ...] = ()
+    """The text must not leave this machine: neither the upstream tier nor another gateway is asked."""
+    submitter: str = ""
+    """Who asks."""
+    from_robot: bool = False
+    """Whether that is a robot, whom the safety policy may allow less."""
 
 
 class PlanOutcome(Struct, frozen=True, kw_only=True):

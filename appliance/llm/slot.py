@@ -13,9 +13,11 @@ import importlib
 import json
 import math
 import os
+import queue
 import re
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -23,10 +25,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import msgspec
 
 from appliance.llm import frames
-from appliance.llm.speaking import Question, Speaker, TooLateError, TooLongError, read_card
+from appliance.llm.embedded import remedy_of
+from appliance.llm.speaking import BrokenOffError, Question, Speaker, TooLateError, TooLongError, read_card
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 _NEEDED = ("genai_config.json",)
 _SPARE = 64
@@ -50,7 +53,7 @@ class SlotError(Exception):
 
 def check_folder(folder: Path) -> None:
     """Refuse a folder that cannot be a model, before the library says it in its own words."""
-    remedy = "set llm.local_model to an onnxruntime-genai folder, or leave it empty"
+    remedy = remedy_of(str(folder))
     if not folder.is_dir():
         raise SlotError("prerequisite", f"there is no model folder {folder}", remedy)
     for name in _NEEDED:
@@ -100,22 +103,25 @@ class Slot:
         self._pieces: dict[str, list[int]] = {}
         self._vocabulary = int(config_text["model"].get("vocab_size", 0))
 
-    def say(self, question: dict[str, Any]) -> dict[str, Any]:
+    def say(self, question: dict[str, Any], stop: "Callable[[], bool]" = lambda: False) -> dict[str, Any]:
         """Answer an instruction in the plan language; `question` is a `Question`, the answer a `Said`."""
         if self.speaker is None:
             raise SlotError("internal", "this model does not speak the plan language")
         try:
-            return msgspec.to_builtins(self.speaker.answer(msgspec.convert(question, Question)))
+            return msgspec.to_builtins(self.speaker.answer(msgspec.convert(question, Question), stop))
+        except BrokenOffError as error:
+            raise SlotError("cancelled", str(error)) from error
         except TooLongError as error:
             raise SlotError("plan", str(error), "split the instruction") from error
         except TooLateError as error:
             raise SlotError("deadline", str(error), "raise llm.local_deadline_s") from error
 
-    def propose(self, request: dict[str, Any]) -> dict[str, Any]:
+    def propose(self, request: dict[str, Any], stop: "Callable[[], bool]" = lambda: False) -> dict[str, Any]:
         """Answer a chat under a grammar.
 
         Args:
             request: `messages`, `grammar`, `choices` (skill and robot names, for the confidence), `deadline_s`.
+            stop: whether nobody waits for the answer any more.
 
         Returns:
             `text`, `confidence` (0 to 1, of the least sure decision), `tokens`, `reused` prompt tokens, `ms`.
@@ -130,7 +136,7 @@ class Slot:
             )
         reused = self._feed(prompt, str(request["grammar"]))
         try:
-            text, confidence = self._generate(request.get("choices") or {}, began + float(request["deadline_s"]))
+            text, confidence = self._generate(request.get("choices") or {}, began + float(request["deadline_s"]), stop)
         except BaseException:
             self._generator = None
             raise
@@ -176,13 +182,15 @@ class Slot:
         params.set_guidance("lark_grammar", grammar, False)
         return self._og.Generator(self._model, params)
 
-    def _generate(self, choices: dict[str, Any], deadline: float) -> tuple[str, float]:
+    def _generate(self, choices: dict[str, Any], deadline: float, stop: "Callable[[], bool]") -> tuple[str, float]:
         stream = self._tokenizer.create_stream()
         text = ""
         sure = 1.0
         while not self._generator.is_done():
             if time.monotonic() > deadline:
                 raise SlotError("deadline", "the local model did not end in time", "raise llm.local_deadline_s")
+            if stop():
+                raise SlotError("cancelled", "nobody waits for the answer any more")
             open_choice = self._open(text, choices)
             logits = self._generator.get_logits() if open_choice else None
             self._generator.generate_next_token()
@@ -249,16 +257,64 @@ def serve(folder: Path, requests: BinaryIO, replies: BinaryIO, *, threads: int, 
         return 5
     speaks = slot.speaker is not None
     frames.write(replies, {"ready": True, "speaks": speaks, "ms": 1000 * (time.monotonic() - began)})
-    while (request := frames.read(requests)) is not None:
-        reply: dict[str, Any] = {"id": request.get("id")}
+    inbox = Inbox(requests)
+    while (request := inbox.next()) is not None:
+        number = request.get("id")
+        reply: dict[str, Any] = {"id": number}
+
+        def stop(number: object = number) -> bool:
+            return inbox.given_up(number)
+
         try:
-            reply |= slot.say(request["question"]) if "question" in request else slot.propose(request)
+            if stop():
+                raise SlotError("cancelled", "nobody waits for the answer any more")  # noqa: TRY301 - as the others
+            reply |= slot.say(request["question"], stop) if "question" in request else slot.propose(request, stop)
         except SlotError as error:
             reply["error"] = {"code": error.code, "message": error.message, "remedy": error.remedy}
         except Exception as error:  # noqa: BLE001 - supervision boundary: named to the gateway, the slot lives on
             reply["error"] = {"code": "internal", "message": f"the local model failed: {error!r}"[:400], "remedy": ""}
+        inbox.forget(number)
         frames.write(replies, reply)
     return 0
+
+
+class Inbox:
+    """What the gateway asks, read by a thread of its own so that a request can be given up while it is worked on."""
+
+    def __init__(self, requests: BinaryIO) -> None:
+        self._requests = requests
+        self._asked: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        self._given_up: set[int] = set()
+        self._ended = False
+        threading.Thread(target=self._read, name="requests", daemon=True).start()
+
+    def next(self) -> dict[str, Any] | None:
+        """Wait for a request; None when there will be none."""
+        return self._asked.get()
+
+    def given_up(self, number: object) -> bool:
+        """Whether nobody waits for the answer to a request any more."""
+        return self._ended or number in self._given_up
+
+    def forget(self, number: object) -> None:
+        """Note that a request was answered; numbers only grow."""
+        if isinstance(number, int):
+            self._given_up = {each for each in self._given_up if each > number}
+
+    def _read(self) -> None:
+        while True:
+            try:
+                frame = frames.read(self._requests)
+            except (OSError, ValueError):
+                frame = None
+            if frame is None:
+                self._ended = True
+                self._asked.put(None)
+                return
+            if "cancel" in frame:
+                self._given_up = {*self._given_up, int(frame["cancel"])}
+            else:
+                self._asked.put(frame)
 
 
 def main() -> int:

@@ -1,12 +1,16 @@
 """A planner that speaks the plan language, in the model's process: numbered words in, symbols out, held to the guide.
 
 Each step takes the likeliest of the symbols that may come (`language.guide`). What the model would have said otherwise
-is not lost: the share of the chosen symbol among the allowed ones says how sure it was. A model folder has, beside what
-the library needs, `planner.json`: which token is which symbol, and how shares become a confidence.
+is not lost: the share of the chosen symbol among the allowed ones says how sure it was, and where another one had a
+fair share the answer is gone through again from there. The likeliest whole answer is given, and the others behind it.
+A model folder has, beside what the library needs, `planner.json`: which token is which symbol, and how shares become
+a confidence.
 """
 
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +23,14 @@ from appliance.llm.language.words import MAX_WORDS, words_of
 CARD = "planner.json"
 MOST_SYMBOLS = 600
 """Of an answer; a longer one is none."""
+TURNS = 3
+"""Answers that are tried besides the one that is likeliest step by step; each takes half an answer's time or so."""
+MOST_OF = 0.5
+"""Share of the time for an answer after which no other one is begun or gone on with."""
+LONGER = 2
+"""Times the symbols of the first answer that the others may have together."""
+FAIR = 0.08
+"""Share of a symbol from which on it is worth an answer of its own."""
 
 
 class Card(Struct, frozen=True, kw_only=True):
@@ -41,13 +53,45 @@ class Question(Struct, frozen=True, kw_only=True):
     deadline_s: float
 
 
+class Other(Struct, frozen=True):
+    """Another answer, and how sure the model is of that one."""
+
+    symbols: tuple[str, ...]
+    confidence: float
+
+
 class Said(Struct, frozen=True, kw_only=True):
     """An answer."""
 
     symbols: tuple[str, ...]
     confidence: float
+    others: tuple["Other", ...] = ()
+    """Likelier ones first."""
     tokens: int
     ms: float
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Where an answer might have gone on otherwise."""
+
+    at: int
+    """Symbols before it."""
+    symbol: str
+    token: int
+    cost: float
+    """Negative logarithm of the probability of all up to and with it."""
+    share: float
+
+
+@dataclass
+class Spoken:
+    """An answer, as far as it is."""
+
+    symbols: list[str] = field(default_factory=list[str])
+    tokens: list[int] = field(default_factory=list[int])
+    cost: float = 0.0
+    turns: list[Turn] = field(default_factory=list[Turn])
 
 
 class TooLongError(Exception):
@@ -56,6 +100,10 @@ class TooLongError(Exception):
 
 class TooLateError(Exception):
     """The answer did not end before its deadline."""
+
+
+class BrokenOffError(Exception):
+    """Nobody waits for the answer any more."""
 
 
 class Speaker:
@@ -79,45 +127,98 @@ class Speaker:
         self._params.set_search_options(max_length=context, do_sample=False)
         self._new = lambda: og.Generator(model, self._params)
 
-    def answer(self, question: Question) -> Said:
+    def answer(self, question: Question, stop: Callable[[], bool] = lambda: False) -> Said:
         """Answer a question.
+
+        Args:
+            question: what is to be planned.
+            stop: whether nobody waits for the answer any more.
 
         Raises:
             TooLongError: too many words, or tokens.
             TooLateError: past the deadline.
+            BrokenOffError: nobody waits.
         """
         began = time.monotonic()
         words = words_of(question.text, question.robots or ())
         prompt = self._prompt([words[number].lower() for number in range(len(words))], words.own)
+        until = began + question.deadline_s
         generator = self._new()
         generator.append_tokens(prompt)
-        guide = Guide(words, question.skills, robots=question.robots, known=self._known)
-        symbols: list[str] = []
-        against = 0.0
-        while True:
-            if time.monotonic() - began > question.deadline_s:
+
+        def guide() -> Guide:
+            return Guide(words, question.skills, robots=question.robots, known=self._known)
+
+        def check() -> None:
+            if time.monotonic() > until:
                 raise TooLateError(f"no answer within {question.deadline_s:g} s")
+            if stop():
+                raise BrokenOffError("nobody waits for the answer any more")
+
+        most = min(MOST_SYMBOLS, self._context - len(prompt) - 2)
+        first = self._followed(generator, guide(), Spoken(), most, check)
+        paths, said = [first], first.tokens
+        # An answer is there: what the others may take is bounded, by symbols, so that the same words get the same plan.
+        until = began + MOST_OF * question.deadline_s
+        left = LONGER * len(first.symbols)
+        spoken = len(first.symbols)
+        turns = sorted((turn for turn in first.turns if turn.share >= FAIR), key=lambda turn: turn.cost)
+        for turn in turns[:TURNS]:
+            other = guide()
+            for symbol in first.symbols[: turn.at]:
+                other.take(symbol)
+            begun = Spoken(symbols=first.symbols[: turn.at], tokens=first.tokens[: turn.at], cost=turn.cost)
+            _set_back(generator, len(prompt), said, begun.tokens)
+            said = begun.tokens
+            try:
+                if self._taken(generator, other, begun, turn.symbol, turn.token):
+                    self._followed(generator, other, begun, min(most, turn.at + left), check)
+                paths.append(begun)
+            except TooLongError:
+                pass
+            except TooLateError:
+                break  # there is an answer
+            spoken += len(begun.symbols) - turn.at
+            left -= len(begun.symbols) - turn.at
+        paths.sort(key=lambda path: path.cost)
+        return Said(
+            symbols=tuple(paths[0].symbols),
+            others=tuple(Other(tuple(path.symbols), self._confidence(path.cost)) for path in paths[1:]),
+            confidence=self._confidence(paths[0].cost),
+            tokens=len(prompt) + spoken,
+            ms=round(1000 * (time.monotonic() - began), 3),
+        )
+
+    def _followed(self, generator: Any, guide: Guide, path: "Spoken", most: int, check: Callable[[], None]) -> "Spoken":
+        """Go on with an answer to its end, by the likeliest symbol each time."""
+        while True:
+            check()
             allowed = [(each, token) for each in guide.allowed() if (token := self._token(each)) is not None]
-            if not allowed or len(symbols) > min(MOST_SYMBOLS, self._context - len(prompt) - 2):
-                raise TooLongError(f"no end after {len(symbols)} symbols")
+            if not allowed or len(path.symbols) > most:
+                raise TooLongError(f"no end after {len(path.symbols)} symbols")
             best = 0
             if len(allowed) > 1:
                 logits = generator.get_logits().reshape(-1)
                 values = [float(logits[token]) for _, token in allowed]
-                best = max(range(len(values)), key=values.__getitem__)
-                against += math.log(sum(math.exp(value - values[best]) for value in values))
-            symbol, token = allowed[best]
-            guide.take(symbol)
-            if guide.ended:
-                break
-            symbols.append(symbol)
-            generator.append_tokens([token])
-        return Said(
-            symbols=tuple(symbols),
-            confidence=self._confidence(against),
-            tokens=len(prompt) + len(symbols),
-            ms=round(1000 * (time.monotonic() - began), 3),
-        )
+                order = sorted(range(len(values)), key=values.__getitem__, reverse=True)
+                best, second = order[:2]
+                total = values[best] + math.log(sum(math.exp(value - values[best]) for value in values))
+                symbol, token = allowed[second]
+                against = total - values[second]
+                path.turns.append(Turn(len(path.symbols), symbol, token, path.cost + against, math.exp(-against)))
+                path.cost += total - values[best]
+            if not self._taken(generator, guide, path, *allowed[best]):
+                return path
+
+    def _taken(self, generator: Any, guide: Guide, path: "Spoken", symbol: str, token: int) -> bool:
+        """Take a symbol; whether the answer goes on."""
+        guide.take(symbol)
+        if guide.ended:
+            return False
+        path.symbols.append(symbol)
+        path.tokens.append(token)
+        generator.append_tokens([token])
+        return True
 
     def _confidence(self, against: float) -> float:
         """Return how sure an answer is whose probability is exp(-against), calibrated on held-out instructions."""
@@ -150,6 +251,16 @@ class Speaker:
                 self._pieces.clear()
             pieces = self._pieces[word] = [int(token) for token in self._tokenizer.encode(word)]
         return pieces
+
+
+def _set_back(generator: Any, prompt: int, said: list[int], wanted: list[int]) -> None:
+    """Bring a generator from what it has said to what it is to have said; both count from the end of the prompt."""
+    same = 0
+    while same < min(len(said), len(wanted)) and said[same] == wanted[same]:
+        same += 1
+    generator.rewind_to(prompt + same)
+    if wanted[same:]:
+        generator.append_tokens(wanted[same:])
 
 
 def read_card(folder: Path) -> Card | None:

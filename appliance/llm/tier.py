@@ -20,6 +20,10 @@ class Proposal(Struct, frozen=True, kw_only=True):
     plan: Plan
     confidence: float
     problems: tuple[str, ...] = ()
+    model: str = ""
+    """The model that wrote it; empty for rules."""
+    gateway: str = ""
+    """The gateway that has that model, if it is another one."""
 
 
 class Planner(Protocol):

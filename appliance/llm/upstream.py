@@ -3,11 +3,16 @@
 Servers differ in what `response_format` they take, so a refused `json_schema` falls back to `json_object`, and that
 to none; what worked is remembered. Failures are sorted by what helps: an answer 429 or 5xx, or no connection, is tried
 again within bounds; a refused key or an unknown model is not. The key is read anew for each request, so that a new one
-needs no restart, and it is never part of a message or a log line.
+needs no restart, and it is never part of a message or a log line. A server that fails again and again is left alone for
+a while (`routing.breaker`), and none is asked once the day's budget is spent: offline is normal.
 """
 
 import asyncio
 import math
+import os
+import time
+from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +20,21 @@ import msgspec
 import structlog
 from msgspec import Struct, field
 
-from appliance.errors import ConfigError, DeadlineError, PayloadError, SwiftbotError, UnreachableError
+from appliance.errors import (
+    ConfigError,
+    DeadlineError,
+    PayloadError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+)
 from appliance.llm.prompt import messages
+from appliance.llm.routing.breaker import Breaker
+from appliance.llm.routing.budget import Budget
 from appliance.llm.schema import MAX_ANSWER_BYTES, plan_schema, read_plan
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
-from appliance.model import Plan, Tier
+from appliance.model import Plan, Tier, UpstreamStatus
 from appliance.skills.catalogue import Catalogue
 
 if TYPE_CHECKING:
@@ -33,6 +47,9 @@ _UNSURE = 0.9
 """Confidence in a valid plan from a server that tells no log-probabilities."""
 _PAUSE_S = 0.5
 _CONNECT_S = 3.0
+KEY_VARIABLE = "SWIFTBOT_UPSTREAM_KEY"
+CREDENTIAL = "swiftbot-upstream-key"
+"""Name of the systemd credential (`LoadCredential=`) that holds the key."""
 
 
 class _Token(Struct):
@@ -54,8 +71,14 @@ class _Choice(Struct):
     logprobs: _Logprobs | None = None
 
 
+class _Usage(Struct):
+    prompt_tokens: int = 0
+    completion_tokens: int = 0
+
+
 class _Completion(Struct):
     choices: list[_Choice]
+    usage: _Usage | None = None
 
 
 class UpstreamTier:
@@ -64,12 +87,46 @@ class UpstreamTier:
     name = Tier.UPSTREAM
     repairs = True
 
-    def __init__(self, config: LlmConfig, catalogue: Catalogue) -> None:
+    def __init__(
+        self,
+        config: LlmConfig,
+        catalogue: Catalogue,
+        budget: Budget | None = None,
+        paid: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Ask nothing yet.
+
+        Args:
+            config: server, key, bounds.
+            catalogue: the skills there are.
+            budget: what it may cost a day; None: whatever it does.
+            paid: told each time that a request was made.
+        """
         self._config = config
         self._catalogue = catalogue
+        self._budget = budget or Budget(cost=0, requests=0, price_in=0, price_out=0)
+        self._paid = paid
+        self._breaker = Breaker(open_s=config.upstream_open_s)
         self._client: httpx.AsyncClient | None = None
         self._format = 0
         self._url = config.upstream_url.rstrip("/") + "/chat/completions"
+
+    @property
+    def model(self) -> str:
+        """Name of the model there."""
+        return self._config.upstream_model
+
+    @property
+    def status(self) -> UpstreamStatus:
+        """How it stands, for GatewayStatus."""
+        now, spent = time.monotonic(), self._budget.on(_today())
+        return UpstreamStatus(
+            state=self._breaker.state(now),
+            retry_after_s=self._breaker.retry_after_s(now),
+            requests=spent.requests,
+            spent=spent.cost,
+            budget=self._config.upstream_budget,
+        )
 
     async def start(self) -> None:
         """Nothing is sent before the first instruction."""
@@ -91,9 +148,30 @@ class UpstreamTier:
             ConfigError: it refuses the key, the address or the model.
             PayloadError: its answer is no chat completion.
             PlanError: its answer is no plan.
+            RefusedError: the day's budget is spent.
         """
+        if why := self._budget.refuses(_today()):
+            raise RefusedError(f"the upstream budget is used up: {why}", remedy="it begins anew tomorrow")
+        now = time.monotonic()
+        if not self._breaker.take(now):
+            raise UnreachableError(
+                f"the upstream server failed several times: left alone for {self._breaker.retry_after_s(now):g} s",
+                remedy="check llm.upstream_url and the network",
+            )
         chat = messages(context, self._catalogue, previous=previous, problems=problems)
-        answer = await self._ask(chat)
+        try:
+            answer = await self._ask(chat)
+        except SwiftbotError:
+            self._breaker.failed(time.monotonic())
+            raise
+        except asyncio.CancelledError:
+            # Mostly the cascade's deadline: a server that never answers in time is as good as none.
+            self._breaker.failed(time.monotonic())
+            raise
+        except BaseException:
+            self._breaker.gave_up()
+            raise
+        self._breaker.succeeded()
         choice = answer.choices[0] if answer.choices else _Choice()
         if choice.finish_reason == "length":
             raise PayloadError(
@@ -101,7 +179,7 @@ class UpstreamTier:
                 remedy="raise llm.upstream_max_tokens, or give the order in parts",
             )
         plan = read_plan(choice.message.content or "", tier=Tier.UPSTREAM)
-        return Proposal(plan=plan, confidence=_confidence(choice.logprobs))
+        return Proposal(plan=plan, confidence=_confidence(choice.logprobs), model=self._config.upstream_model)
 
     async def _ask(self, chat: list[dict[str, str]]) -> _Completion:
         tries = 0
@@ -115,7 +193,11 @@ class UpstreamTier:
                 if status == 200:
                     # Remembered only now: a request refused for another reason must not cost the schema for good.
                     self._format = form
-                    return _decode(body)
+                    answer = _decode(body)
+                    used = answer.usage or _Usage()
+                    self._budget.spend(_today(), tokens_in=used.prompt_tokens, tokens_out=used.completion_tokens)
+                    self._paid()
+                    return answer
                 if status in (400, 422) and form < len(_FORMATS) - 1:
                     log.info("upstream refuses the request", response_format=_FORMATS[form], status=status)
                     form += 1
@@ -159,21 +241,26 @@ class UpstreamTier:
             ) from error
 
     def _key(self) -> dict[str, str]:
-        if not self._config.upstream_key_file:
-            return {}
-        try:
-            key = Path(self._config.upstream_key_file).read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"llm.upstream_key_file {self._config.upstream_key_file} cannot be read: {error}",
-                remedy="write the key to it",
-            ) from error
+        where, key = self._found_key()
         if not key.isascii() or not key.isprintable() or " " in key:
-            raise ConfigError(
-                f"llm.upstream_key_file {self._config.upstream_key_file} does not hold a key",
-                remedy="one line, the key alone",
-            )
+            raise ConfigError(f"{where} does not hold a key", remedy="one line, the key alone")
         return {"authorization": f"Bearer {key}"} if key else {}
+
+    def _found_key(self) -> tuple[str, str]:
+        """Return where the key comes from, and the key: the file, the service's credential, the environment."""
+        file = self._config.upstream_key_file
+        where = f"llm.upstream_key_file {file}"
+        if not file and (credentials := os.environ.get("CREDENTIALS_DIRECTORY")):
+            file = str(Path(credentials) / CREDENTIAL)
+            where = f"the credential {CREDENTIAL}"
+            if not Path(file).is_file():
+                file = ""
+        if not file:
+            return f"the variable {KEY_VARIABLE}", os.environ.get(KEY_VARIABLE, "").strip()
+        try:
+            return where, Path(file).read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{where} cannot be read: {error}", remedy="write the key to it") from error
 
     def _body(self, chat: list[dict[str, str]], form: str) -> dict[str, Any]:
         body: dict[str, Any] = {"model": self._config.upstream_model, "messages": chat, "stream": False}
@@ -202,6 +289,10 @@ class UpstreamTier:
                 f"the upstream server answers {status}: {said!r}", remedy="see its log, try again later"
             )
         return PayloadError(f"the upstream server answers {status}: {said!r}", remedy="see its log")
+
+
+def _today() -> str:
+    return datetime.now().astimezone().date().isoformat()
 
 
 def _decode(body: bytes) -> _Completion:

@@ -58,13 +58,13 @@ def validate(
         return (f"the plan has {len(plan.subtasks)} subtasks: at most {MAX_SUBTASKS}, give the order in parts",)
     problems: list[str] = []
     if plan.domain not in catalogue.domains:
-        problems.append(f"domain {_short(plan.domain)} is unknown: use one of {', '.join(catalogue.domains)}")
+        problems.append(f"domain {shown(plan.domain)} is unknown: use one of {', '.join(catalogue.domains)}")
     problems += _ids(plan)
     problems += _order(plan)
     roster = None if robots is None else {robot.id: robot for robot in robots}
     for subtask in plan.subtasks:
         manifest = catalogue.skills.get(subtask.skill)
-        where = f"{_short(subtask.id)} ({_short(subtask.skill)})"
+        where = f"{shown(subtask.id)} ({shown(subtask.skill)})"
         if manifest is None:
             problems.append(f"{where}: there is no such skill: use one of the catalogue")
             continue
@@ -96,6 +96,11 @@ def able(robot: RobotInfo, manifest: SkillManifest) -> str:
     return ""
 
 
+def is_unnamed(robot: str) -> bool:
+    """Whether a robot is a label for one that is yet to be chosen: any, any1, ..."""
+    return _ANY.fullmatch(robot) is not None
+
+
 def locate(name: str, site: Site) -> Place | None:
     """Return the place a text names: a place of the site, or a coordinate such as "12.5, 7" (metres)."""
     if found := site.find(name):
@@ -109,7 +114,7 @@ def _ids(plan: Plan) -> Iterable[str]:
     seen: set[str] = set()
     for subtask in plan.subtasks:
         if not _ID.fullmatch(subtask.id):
-            yield f"subtask id {_short(subtask.id)} is not allowed: use s1, s2, ..."
+            yield f"subtask id {shown(subtask.id)} is not allowed: use s1, s2, ..."
         elif subtask.id in seen:
             yield f"subtask id {subtask.id} is used twice: give each its own"
         seen.add(subtask.id)
@@ -121,17 +126,17 @@ def _order(plan: Plan) -> Iterable[str]:
     waiting: dict[str, set[str]] = {}
     for subtask in plan.subtasks:
         if len(subtask.after) > MAX_SUBTASKS:
-            yield f"{_short(subtask.id)}: comes after {len(subtask.after)} subtasks: name the direct ones only"
+            yield f"{shown(subtask.id)}: comes after {len(subtask.after)} subtasks: name the direct ones only"
         for other in subtask.after[:MAX_SUBTASKS]:
             if other not in known:
-                yield f"{_short(subtask.id)}: comes after {_short(other)}, which is not in the plan: name one that is"
+                yield f"{shown(subtask.id)}: comes after {shown(other)}, which is not in the plan: name one that is"
             elif other == subtask.id:
-                yield f"{_short(subtask.id)}: comes after itself: take that out"
+                yield f"{shown(subtask.id)}: comes after itself: take that out"
         waiting[subtask.id] = {other for other in subtask.after[:MAX_SUBTASKS] if other in known}
     while free := {each for each, before in waiting.items() if not before}:
         waiting = {each: before - free for each, before in waiting.items() if each not in free}
     if waiting:
-        names = ", ".join(_short(each) for each in list(waiting)[:8])
+        names = ", ".join(shown(each) for each in list(waiting)[:8])
         yield f"subtasks {names} wait for each other in a circle: take one dependency out"
 
 
@@ -142,7 +147,7 @@ def _params(subtask: Subtask, manifest: SkillManifest) -> Iterable[str]:
     for name, value in subtask.params.items():
         if name not in manifest.params:
             known = ", ".join(manifest.params) or "none"
-            yield f"there is no parameter {_short(name)}: {manifest.id} has {known}"
+            yield f"there is no parameter {shown(name)}: {manifest.id} has {known}"
         elif wrong := _wrong_type(value, manifest.params[name]) or _wrong_value(name, value):
             yield f"parameter {name}: {wrong}"
 
@@ -150,7 +155,7 @@ def _params(subtask: Subtask, manifest: SkillManifest) -> Iterable[str]:
 def _wrong_type(value: Any, param: Param) -> str:
     if param.type == "string":
         if not isinstance(value, str):
-            return f"must be text, not {_short(value)}"
+            return f"must be text, not {shown(value)}"
         if len(value) > MAX_TEXT:
             return f"is {len(value)} characters long: at most {MAX_TEXT}"
     elif param.type == "array":
@@ -159,7 +164,7 @@ def _wrong_type(value: Any, param: Param) -> str:
         if len(value) > MAX_ITEMS or any(len(str(item)) > MAX_TEXT for item in value):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
             return f"is too long: at most {MAX_ITEMS} texts of {MAX_TEXT} characters"
     elif isinstance(value, bool) or not isinstance(value, int | float):
-        return f"must be a number, not {_short(value)}"
+        return f"must be a number, not {shown(value)}"
     elif not _within(value):
         return "is not a number that can be meant"
     elif param.type == "integer" and value != int(value):
@@ -189,7 +194,7 @@ def _wrong_value(name: str, value: Any) -> str:
 def _robot(subtask: Subtask, manifest: SkillManifest, roster: dict[str, RobotInfo] | None) -> Iterable[str]:
     if manifest.runs == "compute":
         if subtask.robot is not None:
-            yield f"runs on a gateway, not on {_short(subtask.robot)}: leave the robot out"
+            yield f"runs on a gateway, not on {shown(subtask.robot)}: leave the robot out"
     elif subtask.robot is None:
         yield "no robot is named: name one, or any"
     else:
@@ -202,12 +207,12 @@ def _robot(subtask: Subtask, manifest: SkillManifest, roster: dict[str, RobotInf
         if len(set(names)) != len(names):
             yield "a robot is listed twice: list each once"
         if subtask.robot is not None and names and subtask.robot not in names:
-            yield f"robot {_short(subtask.robot)} is not among its robots: list it first"
+            yield f"robot {shown(subtask.robot)} is not among its robots: list it first"
 
 
 def _named(name: str, manifest: SkillManifest, roster: dict[str, RobotInfo] | None) -> Iterable[str]:
     if not _ROBOT.fullmatch(name):
-        yield f"robot name {_short(name)} is not allowed: use the name in the roster"
+        yield f"robot name {shown(name)} is not allowed: use the name in the roster"
     elif roster is None or _ANY.fullmatch(name):
         return
     elif name == "all":
@@ -270,11 +275,11 @@ def _limits(subtask: Subtask, site: Site) -> Iterable[str]:
         found = locate(place, site)
         if found is None:
             near = ", ".join(sorted(site.places)[:12])
-            yield f"there is no place {_short(place)} on site {site.name}: it knows {near}"
+            yield f"there is no place {shown(place)} on site {site.name}: it knows {near}"
         elif (box := _inside(found, site.forbidden)) is not None:
-            yield f"place {_short(place)} lies in the forbidden area {box.name}: choose another"
+            yield f"place {shown(place)} lies in the forbidden area {box.name}: choose another"
         elif (box := _inside(found, site.obstacles)) is not None:
-            yield f"place {_short(place)} lies inside {box.name}: choose a free one"
+            yield f"place {shown(place)} lies inside {box.name}: choose a free one"
     altitude = params.get("altitude_m")
     if _number(altitude) and altitude > site.altitude_limit_m:
         yield f"altitude {altitude:g} m is above this site's limit of {site.altitude_limit_m:g} m"
@@ -294,7 +299,7 @@ def _inside(place: Place, boxes: Sequence[Box]) -> Box | None:
     return None
 
 
-def _short(value: Any) -> str:
+def shown(value: Any) -> str:
     """Show a value of unknown size and kind safely; plain names stand without quotes."""
     if isinstance(value, str):
         return value if _PLAIN.fullmatch(value) else ascii(value[:60] + ("..." if len(value) > 60 else ""))

@@ -171,7 +171,7 @@ class Guide:
     def _can_be_said(self, skill: str) -> bool:
         """Whether the words have something for all that a skill must be told."""
         manifest = self._skills[skill]
-        return len(self._words) > 0 or not any(param.required for param in manifest.params.values())
+        return bool(self._any_runs(_NAME)) or not any(param.required for param in manifest.params.values())
 
     def _end(self) -> list[str]:
         if any(self._left.values()):
@@ -300,9 +300,12 @@ class Guide:
         return found
 
     def _value_possible(self, name: str) -> bool:
+        """Whether the words have a value for a parameter: an instruction may be a mere question mark."""
         if is_number(name):
             return bool(self._quantities(values.unit_of(name)))
-        return True
+        if name == "robots" or name in _PEOPLE:
+            return True
+        return bool(self._any_runs(_FREE if name in values.FREE else _NAME))
 
     # --- runs of words ----------------------------------------------------------------------------------------
 
@@ -322,7 +325,13 @@ class Guide:
         key = f"any {longest}"
         if key not in self._runs:
             own, count = self._words.own, len(self._words)
-            runs = {first: list(range(first, min(first + longest, own))) for first in range(own)}
+            says = [any(letter.isalnum() for letter in self._words[number]) for number in range(own)]
+            runs: dict[int, list[int]] = {}
+            for first in range(own):
+                # A run of marks alone means nothing, and what is required would be left out.
+                begin = next((number for number in range(first, min(first + longest, own)) if says[number]), own)
+                if lasts := list(range(begin, min(first + longest, own))):
+                    runs[first] = lasts
             self._runs[key] = runs | {number: [number] for number in range(own, count)}
         return self._runs[key]
 

@@ -23,26 +23,28 @@ from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import words_of
 from appliance.llm.slot import Slot
 from appliance.llm.speaking import Question
-from appliance.llm.train.card import card_of, write_card
+from appliance.llm.train.card import card_of, model_card, write_card
 from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.examples import Example
 from appliance.llm.train.judge import is_exact
 from appliance.llm.train.splits import split
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
-from appliance.skills.catalogue import Catalogue, load_catalogue
+from appliance.llm.train.tune import catalogue_of
+from appliance.skills.catalogue import Catalogue
 
 BINS = 10
 
 
-def export(run: Path, folder: Path, *, precision: str = "int4") -> dict[str, object]:
+def export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -> dict[str, object]:
     """Write the model folder; return the reliability curve and how large it is.
 
     Args:
         run: folder of a training run.
         folder: where to; must not exist.
         precision: int4, int8 or fp32, as the builder knows them.
+        most: held-out pairs to calibrate on, drawn evenly from all; 0: all of them.
     """
-    catalogue = load_catalogue()
+    catalogue = catalogue_of(run)
     tokens = Tokens.load(run)
     with tempfile.TemporaryDirectory() as scratch:
         source = Path(scratch) / "source"
@@ -67,16 +69,22 @@ def export(run: Path, folder: Path, *, precision: str = "int4") -> dict[str, obj
     write_card(folder, card_of(tokens, catalogue))
     parts = split(corpus_examples(catalogue))
     held_out = [*parts.structure, *parts.vocabulary, *parts.chance]
+    held_out = held_out[:: max(1, len(held_out) // most)] if most else held_out
     slope, offset, curve = calibrate(folder, held_out, catalogue)
     write_card(folder, card_of(tokens, catalogue, calibration=(slope, offset)))
     size = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
-    return {"megabytes": round(size / 1e6, 1), "calibration": [slope, offset], "reliability": curve}
+    kept = run / "figures.json"
+    figures = json.loads(kept.read_text()) if kept.is_file() else {}
+    recipe = json.loads((run / "recipe.json").read_text())
+    made = {"megabytes": round(size / 1e6, 1), "calibration": [slope, offset], "reliability": curve}
+    (folder / "README.md").write_text(model_card(precision, recipe, figures, made, cases=len(held_out)))
+    return made
 
 
 def calibrate(
     folder: Path, examples: Sequence[Example], catalogue: Catalogue
 ) -> tuple[float, float, list[dict[str, float]]]:
-    """Return slope and offset of the confidence, and the reliability curve after them, over what the slot answers."""
+    """Return slope and offset of the confidence, fitted on half of the examples, and the reliability of the others."""
     slot = Slot(folder)
     odds: list[float] = []
     right: list[bool] = []
@@ -92,7 +100,9 @@ def calibrate(
         share = min(1 - 1e-9, max(1e-9, said.confidence))
         odds.append(math.log(share / (1 - share)))
         right.append(is_exact(read(said.symbols, words, catalogue), read(example.symbols, words, catalogue)))
-    slope, offset = logistic(odds, right)
+    # Fitted on one half and shown on the other: a curve over what it was fitted on would flatter it.
+    slope, offset = logistic(odds[::2], right[::2])
+    odds, right = odds[1::2], right[1::2]
     sure = [1 / (1 + math.exp(-(slope * each + offset))) for each in odds]
     curve: list[dict[str, float]] = []
     for number in range(BINS):
@@ -129,8 +139,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("run", type=Path, help="folder of the run")
     parser.add_argument("folder", type=Path, help="where to")
     parser.add_argument("--precision", default="int4", choices=("int4", "int8", "fp32"))
+    parser.add_argument("--most", type=int, default=0, help="held-out pairs to calibrate on; 0 for all")
     given = parser.parse_args(arguments)
-    print(json.dumps(export(given.run, given.folder, precision=given.precision), indent=1))
+    made = export(given.run, given.folder, precision=given.precision, most=given.most)
+    print(json.dumps(made, indent=1))
     return 0
 
 

@@ -5,37 +5,39 @@
 Every batch follows from the seed and its number, so a run that is stopped goes on from its last checkpoint as if it had
 not been, on a processor or on a GPU, and with any number of workers. The loss counts the answer only.
 
-    python -m appliance.llm.train.fit FOLDER --minutes 60
+The rate is constant and goes down to nothing at the end (`cooldown`). Before it does, the state is kept as `trunk.pt`:
+a run that is done goes on from there when it is given more steps, with more pairs if the corpus has grown.
+
+    python -m appliance.llm.train.fit FOLDER --steps 8000
 """
 
 import argparse
 import json
 import math
-import random
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 from transformers import LlamaConfig, LlamaForCausalLM
 
-from appliance.llm.language.words import MAX_WORDS
+from appliance.llm.train.batches import CONTEXT, Batch, Groups
 from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.examples import Example
+from appliance.llm.train.forward import AnswerLoss
 from appliance.llm.train.judge import judge
-from appliance.llm.train.lexicon import Lexicon
+from appliance.llm.train.site import Pairs
 from appliance.llm.train.splits import split
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
-from appliance.llm.train.vary import vary
-from appliance.skills.catalogue import load_catalogue
+from appliance.skills.catalogue import Catalogue, load_catalogue
 
-CONTEXT = 1024
-"""Tokens of a prompt and its answer; longer examples are left out of a batch."""
-IGNORED = -100
+TRUNK = "trunk.pt"
+CHECKPOINT = "checkpoint.pt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,51 +50,15 @@ class Recipe:
     heads: int = 4
     key_heads: int = 2
     inner: int = 704
-    batch_tokens: int = 8192
-    steps: int = 20_000
-    rate: float = 1.5e-3
-    warmup: int = 300
-    decay: float = 0.05
-    dropout: float = 0.0
+    batch_tokens: int = 4096
+    steps: int = 8_000
+    rate: float = 2e-3
+    warmup: int = 200
+    cooldown: float = 0.35
+    """Share of the steps at the end in which the rate goes down."""
+    decay: float = 0.1
     original: float = 0.1
     """Share of examples as they were written, without variation."""
-
-
-class Batches(Dataset[dict[str, Any]]):
-    """Batches by number: which examples, how varied and how laid out follows from seed and number alone."""
-
-    def __init__(self, examples: Sequence[Example], tokens: Tokens, recipe: Recipe) -> None:
-        self._examples = examples
-        self._tokens = tokens
-        self._recipe = recipe
-        self._lexicon = Lexicon(examples)
-
-    def __len__(self) -> int:
-        return self._recipe.steps
-
-    def __getitem__(self, number: int) -> dict[str, Any]:
-        rng = random.Random(f"{self._recipe.seed} {number}")  # noqa: S311 - a batch to repeat, not a secret
-        rows: list[tuple[list[int], list[int]]] = []
-        longest = 0
-        while True:
-            example = rng.choice(self._examples)
-            if rng.random() >= self._recipe.original:
-                example = vary(example, self._examples, self._lexicon, rng)
-            row = self._tokens.example(example, shift=rng.randrange(MAX_WORDS + 1 - len(example.words)))
-            length = len(row[0]) + len(row[1])
-            if length > CONTEXT:
-                continue
-            if max(longest, length) * (len(rows) + 1) > self._recipe.batch_tokens and rows:
-                break
-            rows.append(row)
-            longest = max(longest, length)
-        inputs = torch.full((len(rows), longest), self._tokens.of(PAD))
-        labels = torch.full((len(rows), longest), IGNORED)
-        for at, (prompt, answer) in enumerate(rows):
-            whole = len(prompt) + len(answer)
-            inputs[at, :whole] = torch.tensor(prompt + answer)
-            labels[at, len(prompt) : whole] = torch.tensor(answer)
-        return {"input_ids": inputs, "labels": labels}
 
 
 def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:
@@ -108,7 +74,6 @@ def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:
         max_position_embeddings=CONTEXT,
         tie_word_embeddings=True,
         rms_norm_eps=1e-5,
-        attention_dropout=recipe.dropout,
         bos_token_id=tokens.of(BEGIN),
         eos_token_id=tokens.of(END),
         pad_token_id=tokens.of(PAD),
@@ -116,97 +81,138 @@ def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:
     return LlamaForCausalLM(config)
 
 
+def cools_at(recipe: Recipe) -> int:
+    """Return the step from which the rate goes down."""
+    return recipe.steps - round(recipe.cooldown * recipe.steps)
+
+
 def rate_at(step: int, recipe: Recipe) -> float:
-    """Return the learning rate of a step: up in a line, down along a cosine to a fiftieth."""
-    if step < recipe.warmup:
-        return recipe.rate * (step + 1) / recipe.warmup
-    part = min(1.0, (step - recipe.warmup) / max(1, recipe.steps - recipe.warmup))
-    return recipe.rate * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * part)))
+    """Return the learning rate of a step: up in a line, constant, and down in a line at the end."""
+    up = min(1.0, (step + 1) / max(1, recipe.warmup))
+    down = min(1.0, (recipe.steps - step) / max(1, recipe.steps - cools_at(recipe)))
+    return recipe.rate * min(up, max(0.0, down))
+
+
+def optimisers_of(model: LlamaForCausalLM, recipe: Recipe) -> list[torch.optim.Optimizer]:
+    """Return Muon for the matrices of the layers, which it learns in fewer steps, and AdamW for the rest."""
+    matrices = [each for each in model.model.layers.parameters() if each.dim() == 2]
+    inside = {id(each) for each in matrices}
+    others = [each for each in model.parameters() if id(each) not in inside]
+    return [
+        torch.optim.Muon(matrices, lr=recipe.rate, weight_decay=recipe.decay, adjust_lr_fn="match_rms_adamw"),
+        torch.optim.AdamW(others, lr=recipe.rate, betas=(0.9, 0.98), weight_decay=0.0, fused=True),
+    ]
 
 
 class Trainer:
     """One run; `folder` holds its tokenizer, recipe, checkpoints and log."""
 
     def __init__(
-        self, folder: Path, recipe: Recipe, *, workers: int = 1, progress: Callable[[str], None] = print
+        self,
+        folder: Path,
+        recipe: Recipe,
+        *,
+        workers: int = 1,
+        progress: Callable[[str], None] = print,
+        catalogue: Catalogue | None = None,
+        site: Pairs | None = None,
+        share: float = 0.5,
+        compiled: bool = False,
     ) -> None:
+        """Go on with the run in `folder`, or begin one there.
+
+        Args:
+            folder: of the run.
+            recipe: how, where the folder has none yet.
+            workers: processes that make batches.
+            progress: told how far it is.
+            catalogue: the skills there are; the built-in ones by default.
+            site: pairs of a site to train on besides (`tune`).
+            share: of a batch that they have.
+            compiled: whether the layers are compiled first (a C++ compiler is needed).
+        """
         self._folder = folder
         self._progress = progress
         self._workers = workers
         folder.mkdir(parents=True, exist_ok=True)
-        self._catalogue = load_catalogue()
+        self._catalogue = catalogue or load_catalogue()
         self._splits = split(corpus_examples(self._catalogue))
+        self._held_out = {name: getattr(self._splits, name) for name in ("structure", "vocabulary", "chance")}
+        self._examples: Sequence[Example] = self._splits.train
+        if site is not None:
+            self._held_out["site"] = site.held_out
+            times = max(1, round(share / (1 - share) * len(self._examples) / max(1, len(site.train))))
+            self._examples = (*self._examples, *(each for each in site.train for _ in range(times)))
         kept = folder / "recipe.json"
         if kept.is_file():
-            recipe = Recipe(**json.loads(kept.read_text()))
+            recipe = replace(Recipe(**json.loads(kept.read_text())), steps=recipe.steps)
             self._tokens = Tokens.load(folder)
         else:
             words = [word for example in self._splits.train for word in example.words]
             self._tokens = Tokens.learn(words, self._catalogue)
             self._tokens.save(folder)
-            kept.write_text(json.dumps(asdict(recipe), indent=1))
+        kept.write_text(json.dumps(asdict(recipe), indent=1))
         self.recipe = recipe
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._model: Any = new_model(recipe, self._tokens).to(self._device)
-        decayed = [each for each in self._model.parameters() if each.dim() > 1]
-        plain = [each for each in self._model.parameters() if each.dim() <= 1]
-        groups = [{"params": decayed, "weight_decay": recipe.decay}, {"params": plain, "weight_decay": 0.0}]
-        self._optimiser = torch.optim.AdamW(groups, lr=recipe.rate, betas=(0.9, 0.98), fused=True)
+        self._loss = AnswerLoss(self._model, compiled=compiled)
+        self._optimisers = optimisers_of(self._model, recipe)
         self._step = 0
+        self._group, self._inside = 0, 0  # the next group of batches, and how many of it were taken
         self._resume()
 
     def _resume(self) -> None:
-        path = self._folder / "checkpoint.pt"
-        if path.is_file():
+        for name in (CHECKPOINT, TRUNK):
+            path = self._folder / name
+            if not path.is_file():
+                continue
             state = torch.load(path, map_location=self._device, weights_only=True)
+            if name == CHECKPOINT and state["cooling"] and state["steps"] != self.recipe.steps:
+                continue  # its rate had begun to go down for an end that is not this one
             self._model.load_state_dict(state["model"])
-            self._optimiser.load_state_dict(state["optimiser"])
-            self._step = int(state["step"])
-            self._progress(f"goes on from step {self._step:,}")
+            for optimiser, kept in zip(self._optimisers, state["optimisers"], strict=False):
+                optimiser.load_state_dict(kept)
+            self._step, self._group, self._inside = int(state["step"]), int(state["group"]), int(state["inside"])
+            self._progress(f"goes on from step {self._step:,} of {name}")
+            return
 
     def save(self) -> None:
         """Write the checkpoint and the model; a run that dies while it does keeps the one before."""
-        state = {"model": self._model.state_dict(), "optimiser": self._optimiser.state_dict(), "step": self._step}
+        state = {
+            "model": self._model.state_dict(),
+            "optimisers": [each.state_dict() for each in self._optimisers],
+            "step": self._step,
+            "group": self._group,
+            "inside": self._inside,
+            "steps": self.recipe.steps,
+            "cooling": self._step > cools_at(self.recipe),
+        }
         torch.save(state, self._folder / "checkpoint.new")
-        (self._folder / "checkpoint.new").replace(self._folder / "checkpoint.pt")
+        (self._folder / "checkpoint.new").replace(self._folder / CHECKPOINT)
         self._model.save_pretrained(self._folder / "model")
 
     def run(self, *, minutes: float = math.inf, look_every: int = 500) -> dict[str, Any]:
         """Train until the recipe's steps are done or the time is over; return the last figures."""
         until = time.monotonic() + 60 * minutes
         parameters = sum(each.numel() for each in self._model.parameters())
-        self._progress(f"{parameters / 1e6:.1f} M parameters, {len(self._splits.train):,} pairs, on {self._device}")
-        batches = Batches(self._splits.train, self._tokens, self.recipe)
-        order = range(self._step, self.recipe.steps)
-        loader = DataLoader(
-            batches,
-            batch_size=None,
-            sampler=order,
-            num_workers=self._workers,
-            prefetch_factor=8 if self._workers else None,
-        )
+        self._progress(f"{parameters / 1e6:.1f} M parameters, {len(self._examples):,} pairs, on {self._device}")
         self._model.train()
         began, seen, shown = time.monotonic(), 0, 0.0
         losses: list[float] = []
-        for batch in self._moved(loader):
-            for group in self._optimiser.param_groups:
-                group["lr"] = rate_at(self._step, self.recipe)
-            with torch.autocast(self._device, dtype=torch.bfloat16):
-                loss = self._model(**batch, use_cache=False).loss
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self._model.parameters(), 1.0)
-            self._optimiser.step()
-            self._optimiser.zero_grad(set_to_none=True)
-            self._step += 1
-            losses.append(float(loss.detach()) if self._step % 10 == 0 else 0.0)
-            seen += batch["input_ids"].numel()
+        for inputs, labels in self._batches():
+            if not losses:
+                self._compare(inputs[:4], labels[:4])
+            if self._step == cools_at(self.recipe):
+                self.save()
+                shutil.copyfile(self._folder / CHECKPOINT, self._folder / TRUNK)
+            losses.append(self._learn(inputs, labels))
+            del losses[:-200]
+            seen += inputs.numel()
             now = time.monotonic()
             if now - shown > 15:
-                recent = [each for each in losses[-200:] if each]
-                mean = sum(recent) / len(recent) if recent else float("nan")
                 self._progress(
-                    f"step {self._step:,} of {self.recipe.steps:,}: "
-                    f"loss {mean:.4f}, {seen / (now - began):,.0f} tokens/s"
+                    f"step {self._step:,} of {self.recipe.steps:,}: loss {sum(losses) / len(losses):.4f}, "
+                    f"{seen / (now - began):,.0f} tokens/s"
                 )
                 shown = now
             if self._step % look_every == 0:
@@ -219,17 +225,62 @@ class Trainer:
         (self._folder / "figures.json").write_text(json.dumps(figures, indent=1))
         return figures
 
-    def _moved(self, loader: "DataLoader[dict[str, Any]]") -> Iterator[dict[str, Any]]:
-        for batch in loader:
-            yield {name: each.to(self._device, non_blocking=True) for name, each in batch.items()}
+    def _compare(self, inputs: torch.Tensor, labels: torch.Tensor) -> None:
+        """Make sure that what is trained is what will be run: the library's pass gives the same loss, rounded."""
+        inputs, labels = inputs.to(self._device), labels.to(self._device)
+        with torch.no_grad():
+            ours = float(self._loss(inputs, labels))
+            theirs = float(self._model(input_ids=inputs, labels=labels, use_cache=False).loss)
+        if not abs(ours - theirs) <= 0.02 * theirs + 0.01:
+            raise RuntimeError(f"the training pass gives a loss of {ours:.4f} where the library's gives {theirs:.4f}")
+
+    def _learn(self, inputs: torch.Tensor, labels: torch.Tensor) -> float:
+        rate = rate_at(self._step, self.recipe)
+        loss = self._loss(inputs.to(self._device), labels.to(self._device))
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._model.parameters(), 1.0)
+        for optimiser in self._optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        self._step += 1
+        self._inside += 1
+        return float(loss.detach())
+
+    def _batches(self) -> Iterator[Batch]:
+        """Return the batches that are left, in order; where it is in them is kept."""
+        recipe = self.recipe
+        groups = Groups(
+            self._examples,
+            self._tokens,
+            seed=recipe.seed,
+            batch_tokens=recipe.batch_tokens,
+            original=recipe.original,
+        )
+        # No group has fewer than one batch: there are always enough.
+        order = range(self._group, self._group + recipe.steps + 1)
+        ahead = 2 if self._workers else None
+        loader: DataLoader[list[Batch]] = DataLoader(
+            groups, batch_size=None, sampler=order, num_workers=self._workers, prefetch_factor=ahead
+        )
+        for batches in loader:
+            for batch in batches[self._inside :]:
+                if self._step >= recipe.steps:
+                    return
+                yield batch
+            self._group, self._inside = self._group + 1, 0
+
+    def look(self, most: int = 200) -> dict[str, Any]:
+        """Return figures on what is held out, before anything is trained."""
+        return self._look(most)
 
     def _look(self, most: int) -> dict[str, Any]:
         """Tell how the model does on what is held out."""
         self._model.eval()
         figures: dict[str, Any] = {"step": self._step}
-        for name in ("structure", "vocabulary", "chance"):
-            examples = getattr(self._splits, name)[:most]
-            figures[name] = judge(self._model, self._tokens, examples, self._catalogue)
+        for name, examples in self._held_out.items():
+            figures[name] = judge(self._model, self._tokens, examples[:most], self._catalogue)
             self._progress(f"  {name}: {figures[name]}")
         self._model.train()
         with (self._folder / "log.jsonl").open("a") as log:
@@ -247,13 +298,28 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "--look-every", type=int, default=500, metavar="STEPS", help="how often held-out figures are taken"
     )
-    for name, kind in Recipe.__annotations__.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=getattr(Recipe, name))
+    parser.add_argument(
+        "--compile", action="store_true", help="compile the layers first: a minute, and a C++ compiler is needed"
+    )
+    for each in fields(Recipe):
+        kind = type(each.default)
+        parser.add_argument(f"--{each.name.replace('_', '-')}", type=kind, help=f"by default {each.default}")
     given = parser.parse_args(arguments)
     if given.threads:
         torch.set_num_threads(given.threads)
-    recipe = Recipe(**{name: getattr(given, name) for name in Recipe.__annotations__})
-    trainer = Trainer(given.folder, recipe, workers=given.workers, progress=lambda text: print(text, flush=True))
+    said = {each.name: value for each in fields(Recipe) if (value := getattr(given, each.name)) is not None}
+    kept = given.folder / "recipe.json"
+    recipe = Recipe(**json.loads(kept.read_text())) if kept.is_file() else Recipe()
+    other = {name for name, value in said.items() if getattr(recipe, name) != value} - {"steps"}
+    if kept.is_file() and other:
+        parser.error(f"{given.folder} was begun with other {', '.join(sorted(other))}: begin another run")
+    trainer = Trainer(
+        given.folder,
+        replace(recipe, **said),
+        workers=given.workers,
+        progress=lambda text: print(text, flush=True),
+        compiled=given.compile,
+    )
     print(json.dumps(trainer.run(minutes=given.minutes, look_every=given.look_every), indent=1))
     return 0
 

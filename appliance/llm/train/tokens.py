@@ -74,6 +74,14 @@ class Tokens:
         tokenizer.train_from_iterator(words, trainer)
         return cls(tokenizer)
 
+    def extended(self, catalogue: Catalogue) -> "Tokens":
+        """Return the tokens with those of skills and parameters that a catalogue has besides, behind all others."""
+        tokenizer = Tokenizer.from_str(self.tokenizer.to_str())
+        tokenizer.add_special_tokens(  # pyright: ignore[reportUnknownMemberType]
+            [each for each in (f"<{s}>" for s in symbols_of(catalogue)) if each not in self._id]
+        )
+        return Tokens(tokenizer)
+
     @classmethod
     def load(cls, folder: Path) -> "Tokens":
         """Read `tokenizer.json` of a model folder."""

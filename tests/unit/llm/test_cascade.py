@@ -167,8 +167,8 @@ async def test_unsure_plan_is_kept_for_when_nothing_better_comes(build: Build) -
 
 async def test_very_unsure_plan_is_not_taken(build: Build) -> None:
     """Below the floor even a valid plan is refused."""
-    with pytest.raises(PlanError, match=r"confidence 0\.10 is below 0\.60"):
-        await build(FakeTier(Tier.LOCAL, sure(going(), 0.1))).plan(ASK)
+    with pytest.raises(PlanError, match=r"confidence 0\.05 is below 0\.60"):
+        await build(FakeTier(Tier.LOCAL, sure(going(), 0.05))).plan(ASK)
 
 
 async def test_private_instruction_does_not_leave_the_machine(build: Build) -> None:
@@ -196,9 +196,9 @@ async def test_confidence_out_of_range_is_held(build: Build) -> None:
 
 async def test_calls_at_the_same_time_do_not_mix(build: Build) -> None:
     """Two instructions planned at once each get their own attempts."""
-    cascade = build(FakeTier(Tier.LOCAL, sure(going("a")), sure(going("b"))))
+    cascade = build(FakeTier(Tier.LOCAL, sure(going("dock 1")), sure(going("dock"))))
     first, second = await asyncio.gather(cascade.plan(ASK), cascade.plan(ASK))
-    assert {first.plan.subtasks[0].params["place"], second.plan.subtasks[0].params["place"]} == {"a", "b"}
+    assert {first.plan.subtasks[0].params["place"], second.plan.subtasks[0].params["place"]} == {"dock 1", "dock"}
     assert (len(first.attempts), len(second.attempts)) == (1, 1)
 
 
@@ -213,11 +213,12 @@ async def test_start_and_close_survive_a_bad_tier(build: Build) -> None:
     assert good.closed
 
 
-async def test_default_configuration_has_the_rules_alone(
+async def test_without_models_the_rules_plan_alone(
     catalogue: Catalogue, robots: tuple[RobotInfo, ...], site: Site
 ) -> None:
     """With no model and no server configured, plain orders are planned by rules against roster and site."""
-    cascade = Decomposer(LlmConfig(), catalogue)
+    assert Decomposer(LlmConfig(), catalogue).tiers == ("local", "rules")
+    cascade = Decomposer(LlmConfig(local_model=""), catalogue)
     assert cascade.tiers == ("rules",)
     await cascade.start()
     try:

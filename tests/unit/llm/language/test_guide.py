@@ -46,7 +46,8 @@ def test_whatever_follows_it_is_a_plan(data: st.DataObject, instruction: str, ro
     assert answer.refused or answer.subtasks
     for subtask in answer.subtasks:
         manifest = CATALOGUE.skills[subtask.skill]
-        assert all(name in subtask.params for name, param in manifest.params.items() if param.required)
+        # Something that is said, not a mark of the text: an empty value would be as good as none.
+        assert all(subtask.params.get(name) for name, param in manifest.params.items() if param.required)
         if robots is not None and subtask.robot is not None and not subtask.robot.startswith("any"):
             assert subtask.robot in robots
 

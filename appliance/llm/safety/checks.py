@@ -1,0 +1,238 @@
+"""The safety policy as a function of a plan: what of it is not allowed, with subtask and remedy. Pure.
+
+What a plan does not say counts as far as it is known: the skill's usual value (`Param.usual` of its manifest), the home
+that a robot has told. Speeds and take-off heights that a skill chooses are lowered when they are sent
+(`robots.bounds`); for how long it does something has to be said where its usual time is above a limit, or not known.
+"""
+
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+from appliance.llm.safety.contradictions import contradictions, precedes
+from appliance.llm.safety.places import known_as, parts_of, spot_of
+from appliance.llm.safety.settings import RobotLimits, SafetyConfig
+from appliance.llm.settings import PlanContext
+from appliance.llm.validate import MAX_PROBLEMS, able, is_unnamed, shown
+from appliance.model import Plan, RobotInfo, Site, Subtask
+from appliance.skills.catalogue import Catalogue
+
+PLACES = ("place", "area", "station", "path", "at", "to", "into", "asset", "target", "object")
+"""Parameters that may name where a robot goes, or what it goes to."""
+_LEAVES = frozenset({"goto", "follow_path", "patrol", "explore", "map_area", "orbit", "return_home", "dock", "follow",
+                     "guide", "rendezvous", "form_up", "lift_together"})  # fmt: skip
+"""Skills after which a robot is no longer where it was."""
+_LOWERED = frozenset({"altitude_m", "speed_mps"})
+"""What a skill chooses of these is lowered to the limit when it is sent."""
+_LIMITS = (("altitude_m", "m", "altitude"), ("speed_mps", "m/s", "speed"), ("duration_s", "s", "duration"))
+
+
+class _Goal(NamedTuple):
+    """Where a subtask goes: as names are compared, and as it is told."""
+
+    name: str
+    said: str
+
+
+def unsafe(plan: Plan, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> tuple[str, ...]:
+    """Return what of a plan the policy does not allow; none means that it may run, as far as this is concerned.
+
+    Args:
+        plan: one that `validate` has passed.
+        context: roster, site, and who asks.
+        catalogue: the skills there are.
+        config: the policy.
+    """
+    problems: list[str] = []
+    for subtask in plan.subtasks:
+        where = f"{shown(subtask.id)} ({shown(subtask.skill)})"
+        problems += [f"{where}: {text}" for text in _subtask(subtask, context, catalogue, config)]
+    problems += contradictions(plan)
+    problems += _exclusive(plan, context, catalogue, config)
+    return tuple(problems[:MAX_PROBLEMS])
+
+
+def _subtask(subtask: Subtask, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> Iterable[str]:
+    if pattern := matched(subtask.skill, config.skills_never):
+        yield f"the policy forbids the skill (safety.skills_never: {pattern}): leave it out"
+    goals = _goals(subtask, catalogue)
+    homes = _homes(subtask, context, catalogue)
+    for goal in (*goals, *homes.values()):
+        if pattern := matched_any(known_as(goal.name, context.site), config.places_never):
+            yield f"the policy forbids {goal.said} (safety.places_never: {pattern}): choose another"
+        if context.site is not None and (area := _forbidden(goal.name, context.site)):
+            yield f"{goal.said} lies in the forbidden area {area}: choose another"
+    if subtask.robot is None:
+        return
+    if context.from_robot and config.robot_tasks != "any":
+        if config.robot_tasks == "never":
+            yield "tasks of robots may command no robot (safety.robot_tasks)"
+        elif robots_of(subtask) != {context.submitter}:
+            yield f"a task of {shown(context.submitter)} may command no other robot (safety.robot_tasks)"
+    for robot in _candidates(subtask, context.robots, catalogue):
+        own = [homes[robot]] if robot in homes else []
+        yield from _limited(subtask, robot, [*goals, *own], context.site, catalogue, config.limits)
+
+
+def _limited(
+    subtask: Subtask,
+    robot: str,
+    goals: Sequence[_Goal],
+    site: Site | None,
+    catalogue: Catalogue,
+    limits: Sequence[RobotLimits],
+) -> Iterable[str]:
+    holding = [each for each in limits if matched(robot, each.robots)]
+    if any(matched(subtask.skill, each.skills_never) for each in holding):
+        yield f"{robot} may not do this (safety.limits): name another robot"
+    highest = strictest(limits, robot, "altitude_m")
+    for goal in goals:
+        if any(matched_any(known_as(goal.name, site), each.places_never) for each in holding):
+            yield f"{robot} may not go to {goal.said} (safety.limits): name another robot or place"
+        spot = spot_of(goal.name, site)
+        if spot is not None and highest is not None and spot.z > highest:
+            yield f"{goal.said} is {spot.z:g} m up, above the limit of {robot}, {highest:g} m: choose a lower place"
+    for key, unit, word in _LIMITS:
+        bound = strictest(limits, robot, key)
+        if bound is None:
+            continue
+        value = subtask.params.get(key)
+        if isinstance(value, int | float):
+            if value > bound:
+                yield f"{word} {value:g} {unit} is above the limit of {robot}, {bound:g} {unit}: ask for less"
+        elif key not in _LOWERED and (why := _too_long(subtask, key, bound, catalogue)):
+            yield f"{why} the limit of {robot} is {bound:g} {unit}: say a {word} of at most that"
+
+
+def _too_long(subtask: Subtask, key: str, bound: float, catalogue: Catalogue) -> str:
+    """Why what a skill does by itself where its plan says nothing may be more than a bound; empty when it is not."""
+    manifest = catalogue.skills.get(subtask.skill)
+    param = manifest.params.get(key) if manifest is not None else None
+    if param is None or (isinstance(param.usual, int | float) and param.usual <= bound):
+        return ""
+    usual = f"is usually {param.usual:g}" if isinstance(param.usual, int | float) else "is not known beforehand"
+    return f"{key} {usual} and"
+
+
+def strictest(limits: Sequence[RobotLimits], robot: str, key: str) -> float | None:
+    """Return the least bound of that kind (`altitude_m`, `speed_mps`, `duration_s`) that holds for a robot, or None."""
+    found: list[float] = [
+        bound for each in limits if matched(robot, each.robots) and (bound := getattr(each, key)) is not None
+    ]
+    return min(found, default=None)
+
+
+def _candidates(subtask: Subtask, robots: Sequence[RobotInfo] | None, catalogue: Catalogue) -> list[str]:
+    """The robots that may come to do a subtask: those it names, or all that could be chosen."""
+    names = robots_of(subtask)
+    unnamed = any(is_unnamed(each) or each == "all" for each in names)
+    found = [each for each in names if not is_unnamed(each) and each != "all"]
+    if unnamed:
+        manifest = catalogue.skills.get(subtask.skill)
+        found += [each.id for each in robots or () if manifest is None or not able(each, manifest)]
+    return sorted(set(found))
+
+
+def _exclusive(plan: Plan, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> Iterable[str]:
+    """Visits of different robots to a place for one, that may fall together."""
+    if not config.exclusive_places:
+        return
+    before = precedes(plan)
+    visits = [
+        (each, place, robots)
+        for each in plan.subtasks
+        if each.skill in _LEAVES
+        for place, robots in _visits(each, context, catalogue, config).items()
+    ]
+    for number, (one, place, robots) in enumerate(visits):
+        for other, same, others in visits[number + 1 :]:
+            if same != place or robots & others:
+                continue
+            if not (_gone(plan, one, other, before) or _gone(plan, other, one, before)):
+                yield (
+                    f"{one.id} and {other.id}: {place} is for one robot at a time (safety.exclusive_places): "
+                    "have one leave before the other comes"
+                )
+    for each, place, robots in visits:
+        if len(robots) > 1:
+            yield f"{each.id}: {place} is for one robot at a time (safety.exclusive_places): choose another place"
+
+
+def _visits(subtask: Subtask, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> dict[str, set[str]]:
+    """The places for one that a subtask visits, each by the one name that it has on the site, and with which robots."""
+    named = robots_of(subtask)
+    doing = set(_candidates(subtask, context.robots, catalogue)) if "all" in named else named
+    found: dict[str, set[str]] = {}
+    goals = [(goal, doing) for goal in _goals(subtask, catalogue)]
+    for robot, goal in _homes(subtask, context, catalogue).items():
+        goals.append((goal, {robot} if robot in doing else doing))
+    for goal, robots in goals:
+        names = known_as(goal.name, context.site)
+        if matched_any(names, config.exclusive_places):
+            found.setdefault(names[0], set()).update(robots)
+    return found
+
+
+def _gone(plan: Plan, first: Subtask, then: Subtask, before: dict[str, set[str]]) -> bool:
+    """Whether the first robot has left for elsewhere before the other comes."""
+    return any(
+        each.id != first.id
+        and each.skill in _LEAVES
+        and robots_of(each) == robots_of(first)
+        and first.id in before[each.id]
+        and each.id in before[then.id]
+        for each in plan.subtasks
+    )
+
+
+def places_of(subtask: Subtask) -> list[str]:
+    """Return what a subtask names of places and things, in the form in which names are compared; a route in parts."""
+    found = [subtask.params.get(key) for key in PLACES]
+    return list(dict.fromkeys(name for each in found if isinstance(each, str) for name in parts_of(each)))
+
+
+def _goals(subtask: Subtask, catalogue: Catalogue) -> list[_Goal]:
+    """Where a subtask goes: what it names, and what its skill takes where it names nothing."""
+    found = [_Goal(name, shown(name)) for name in places_of(subtask)]
+    manifest = catalogue.skills.get(subtask.skill)
+    for key, param in manifest.params.items() if manifest is not None else ():
+        if key in PLACES and isinstance(param.usual, str) and not isinstance(subtask.params.get(key), str):
+            found += [_Goal(name, f"{shown(name)}, its usual {key},") for name in parts_of(param.usual)]
+    return found
+
+
+def _homes(subtask: Subtask, context: PlanContext, catalogue: Catalogue) -> dict[str, _Goal]:
+    """Where a subtask that has its robot return goes to, by robot: the home it has told, else the site's `home`."""
+    manifest = catalogue.skills.get(subtask.skill)
+    if manifest is None or "return_home" not in manifest.verbs:
+        return {}
+    told = {each.id: each.home for each in context.robots or () if each.home is not None}
+    return {
+        robot: _Goal(f"{told[robot].x:.2f}, {told[robot].y:.2f}" if robot in told else "home", f"the home of {robot}")
+        for robot in _candidates(subtask, context.robots, catalogue)
+    }
+
+
+def robots_of(subtask: Subtask) -> set[str]:
+    """Return the robots of a subtask, labels such as `any1` included."""
+    listed: object = subtask.params.get("robots")
+    names = [each for each in listed if isinstance(each, str)] if isinstance(listed, list | tuple) else []  # pyright: ignore[reportUnknownVariableType]
+    return {*names, *([subtask.robot] if subtask.robot else [])}
+
+
+def matched(name: str, patterns: Iterable[str]) -> str:
+    """Return the first pattern that a name matches, or ""."""
+    return next((each for each in patterns if fnmatchcase(name, each)), "")
+
+
+def matched_any(names: Iterable[str], patterns: Sequence[str]) -> str:
+    """Return the first pattern that one of several names matches, or ""."""
+    return next((found for each in names if (found := matched(each, patterns))), "")
+
+
+def _forbidden(name: str, site: Site) -> str:
+    found = spot_of(name, site)
+    if found is None:
+        return ""
+    inside = (box for box in site.forbidden if box.x[0] <= found.x <= box.x[1] and box.y[0] <= found.y <= box.y[1])
+    return next((box.name for box in inside), "")
