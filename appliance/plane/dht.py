@@ -8,10 +8,10 @@ the membership differ for a moment, or a partition) make concurrent versions, wh
 
 import asyncio
 import contextlib
+import random
 import uuid
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import structlog
 
@@ -20,6 +20,7 @@ from appliance.model import VersionVector
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, StoreAsk, Written
 from appliance.plane.pulse import Pulse
+from appliance.plane.pushing import Pushing
 from appliance.plane.quorum.voting import Voting
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import AtOnce, Rpc
@@ -48,9 +49,6 @@ _AGAIN_S = 0.03
 """Between tries while the membership settles."""
 _SETTLE_S = 2.0
 """How long an owner lets requests wait for its reconciling; then it answers with what it has."""
-_PUSH_AGAIN_S = (0.5, 2.0)
-"""When a replica that was too slow for a write is offered the record again."""
-_MOST_PUSHES = 256
 
 
 class Dht:
@@ -76,12 +74,17 @@ class Dht:
         self._membership = membership
         self._pulse = pulse
         self._voting = voting
-        voting.learn = self._learn
         voting.resolver = lambda: self.resolver or by_bytes
+        self.on_wanted: Callable[[], None] = lambda: None
+        """Called when a request waits for the shard to be reconciled."""
+        self.returned: frozenset[str] = frozenset()
+        """Members that were away and have come back, with whom the shard is not compared yet: on the other side of a
+        cut they may have ordered writes."""
         self._stalls = 0
         self._settled = Ring((), virtual_nodes=config.virtual_nodes)
         self._settling = asyncio.Condition()
-        self._pushes: set[asyncio.Task[None]] = set()
+        self._pushing = Pushing(config, gateway=gateway, store=store, rpc=rpc, membership=membership, keep=self.keep)
+        voting.learn = self._pushing.learn
         self._unsaved: set[str] = set()
         """Keys whose last decision here the replicas may have and the disk has not."""
         rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, at_once=self._read_at_once)
@@ -92,11 +95,12 @@ class Dht:
 
     # --- the door ---------------------------------------------------------------------------------------------
 
-    async def read(self, key: str, *, quorum: bool = False) -> Record | None:
+    async def read(self, key: str, *, quorum: bool = False, replica: bool = False) -> Record | None:
         """Return a record from its owner or, when that does not answer, the next replica; None: there is none.
 
         `quorum`: as a majority of the key's voters has it, so that no write with a quorum that was acknowledged
         before is missed (linearizable, `plane.quorum`).
+        `replica`: as this gateway has it if it holds a copy, else as any of those that do; it may be behind.
 
         Raises:
             UnreachableError: none of the replicas answered; `quorum`: fewer than a majority of the voters.
@@ -107,10 +111,14 @@ class Dht:
             chosen = await self._voting.read(key)
             return None if chosen is None or chosen.deleted else chosen
         problem: SwiftbotError | None = None
-        for gateway in await self._membership.holders(key, self._config.replicas):
+        holders = list(await self._membership.holders(key, self._config.replicas))
+        if replica:
+            random.shuffle(holders)
+            holders.sort(key=lambda name: name != self._gateway)
+        for gateway in holders:
             try:
                 if gateway == self._gateway:
-                    record = (await self._on_read(KeyAsk(key))).record
+                    record = await self._store.record(key) if replica else (await self._on_read(KeyAsk(key))).record
                 else:
                     found = await self._rpc.call(
                         gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S, direct=True
@@ -233,7 +241,7 @@ class Dht:
             Its version, once they and this gateway agree.
         """
         others = [each for each in self._replicas(record.key) if each != self._gateway]
-        pushed = asyncio.gather(*(self._push(each, record, durable=asked.durable) for each in others))
+        pushed = asyncio.gather(*(self._pushing.push(each, record, durable=asked.durable) for each in others))
         try:
             await committed
         except BaseException as error:
@@ -251,61 +259,8 @@ class Dht:
             record = await self.keep(each)
         if record.write != asked.write:
             raise ConflictError(f"{record.key} was written elsewhere too", remedy="read it and decide again")
-        await asyncio.gather(*(self._push(each, record) for each in others))
+        await asyncio.gather(*(self._pushing.push(each, record) for each in others))
         return record.version
-
-    async def _push(self, gateway: str, record: Record, *, durable: bool = True) -> Record | None:
-        """Have a replica store a record; returns what it holds if that is something else."""
-        timeout_s = self._config.replica_timeout_s
-        try:
-            ask = StoreAsk(record, durable)
-            answer = await self._rpc.call(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
-        except UnreachableError:
-            return None  # gone: its successor in the replica set takes the record when it reconciles
-        except (DeadlineError, RefusedError) as error:
-            log.warning("a replica is slow", replica=gateway, key=record.key, reason=str(error))
-            self._later(self._push_again(gateway, record.key))
-            return None
-        except SwiftbotError as error:
-            log.error(  # noqa: TRY400 - the replica's own reason says more than our traceback
-                "a replica cannot store", replica=gateway, key=record.key, reason=str(error)
-            )
-            return None
-        return answer.record
-
-    async def _learn(self, record: Record) -> None:
-        """A quorum has chosen a record: the ordinary copies follow, while the writer goes on."""
-        if len(self._pushes) >= _MOST_PUSHES:
-            await self._spread(record)
-        else:
-            self._later(self._spread(record))
-
-    async def _spread(self, record: Record) -> None:
-        with contextlib.suppress(SwiftbotError):  # nobody to hold a copy is reached: a later one comes with the next
-            holders = await self._membership.holders(record.key, self._config.replicas)
-            if self._gateway in holders:
-                await self.keep(record)
-            await asyncio.gather(*(self._push(each, record) for each in holders if each != self._gateway))
-
-    def _later(self, push: Coroutine[Any, Any, None]) -> None:
-        if len(self._pushes) >= _MOST_PUSHES:
-            push.close()  # anti-entropy will find it
-            return
-        task = asyncio.create_task(push)
-        self._pushes.add(task)
-        task.add_done_callback(self._pushes.discard)
-
-    async def _push_again(self, gateway: str, key: str) -> None:
-        for wait_s in _PUSH_AGAIN_S:
-            await asyncio.sleep(wait_s)
-            record = await self._store.record(key)
-            if record is None or gateway not in self._membership.members:
-                return
-            with contextlib.suppress(SwiftbotError):
-                answer = await self._rpc.call(gateway, "dht_store", StoreAsk(record), Found, timeout_s=_ATTEMPT_S)
-                if answer.record is not None:
-                    await self.keep(answer.record)
-                return
 
     async def _catch_up(self, key: str) -> None:
         """Ask every other replica for its version: the writer has seen one newer than ours."""
@@ -366,7 +321,7 @@ class Dht:
         return record if kept is None else kept
 
     async def _on_record_read(self, asked: RecordAsk) -> Found:
-        return Found(await self.read(asked.key, quorum=asked.quorum))
+        return Found(await self.read(asked.key, quorum=asked.quorum, replica=asked.replica))
 
     async def _on_record_write(self, asked: RecordChange) -> Written:
         write = Write(
@@ -395,15 +350,21 @@ class Dht:
             self._settling.notify_all()
 
     def _mine(self, key: str) -> bool:
-        """Whether a key was this gateway's when it last reconciled; from any thread."""
+        """Whether a key was this gateway's when it last reconciled, and nobody has come back since who may know more.
+
+        From any thread.
+        """
         settled = self._settled
         known = bool(settled.members) and self._stalls == self._pulse.stalls
-        return known and settled.owner(key) == self._gateway
+        if not known or settled.owner(key) != self._gateway:
+            return False
+        return not self.returned or self.returned.isdisjoint(self._replicas(key))
 
     async def _until_settled(self, key: str) -> None:
         """Wait until this gateway has reconciled as the key's owner; it may have become that just now."""
         if self._mine(key):
             return
+        self.on_wanted()
         try:
             async with asyncio.timeout(_SETTLE_S), self._settling:
                 await self._settling.wait_for(partial(self._mine, key))
@@ -412,9 +373,7 @@ class Dht:
 
     async def close(self) -> None:
         """Give up what is still being pushed."""
-        for task in self._pushes:
-            task.cancel()
-        await asyncio.gather(*self._pushes, return_exceptions=True)
+        await self._pushing.close()
 
 
 def _settle(other: Record, resolver: Resolver, mine: Record | None) -> Record:

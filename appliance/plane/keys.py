@@ -73,6 +73,10 @@ class Keys:
         """Put by a gateway that wants runs moved away: MigrationRequest."""
         return f"{self.root}/gw/{gateway}/migration"
 
+    def decided(self, gateway: str = "*", what: str = "*") -> str:
+        """Put: a decision with all that it rests on, so that a log can be checked: `placement`, `selection`, ..."""
+        return f"{self.root}/gw/{gateway}/decided/{what}"
+
     # tasks
     def task(self, task: str = "*") -> str:
         """Put by the coordinator on every change: TaskRecord."""
@@ -111,6 +115,14 @@ class Keys:
         """Put: each raw MAVLink frame; direction `rx` (from the vehicle) or `tx`."""
         return f"{self.root}/robot/{robot}/mavlink/{direction}"
 
+    def links(self, gateway: str = "*") -> str:
+        """Put every second by a gateway with MAVLink links: LinkList."""
+        return f"{self.root}/gw/{gateway}/mavlink/links"
+
+    def link_frames(self, gateway: str = "*", link: str = "*", direction: str = "*") -> str:
+        """Put: each raw MAVLink frame of a link that is from or to no vehicle; direction `rx` (heard) or `tx`."""
+        return f"{self.root}/gw/{gateway}/mavlink/{link}/{direction}"
+
     def intake(self, robot: str = "*") -> str:
         """Put by a robot: TaskRequest."""
         return f"{self.root}/robot/{robot}/task"
@@ -129,10 +141,48 @@ class Keys:
         """Put: Notice to a person."""
         return f"{self.root}/notice/{to}"
 
+    # replays
+    def clock(self) -> str:
+        """Put by a replay: Clock, the time in the log that is being played."""
+        return f"{self.root}/recorder/replay/clock"
+
+    # operators
+    def act(self, gateway: str = "*") -> str:
+        """Put by the gateway that an operator's order was given to: Act, what came of it."""
+        return f"{self.root}/operator/act/{gateway}"
+
+    def soft_stop(self, act: str = "*") -> str:
+        """Put by an operator's tool, and by the gateway that keeps it: SoftStop."""
+        return f"{self.root}/operator/stop/{act}"
+
+    def lifted(self, act: str = "*") -> str:
+        """Put by the gateway that keeps it: Lifted, of soft stops."""
+        return f"{self.root}/operator/resume/{act}"
+
+    def lease(self, robot: str = "*") -> str:
+        """Put when an operator takes a robot over, at each renewal and at the end: Lease."""
+        return f"{self.root}/operator/lease/{robot}"
+
+    def enquiry(self, enquiry: str = "*") -> str:
+        """Put when a skill or robot asks people something, and when it is answered: Enquiry."""
+        return f"{self.root}/operator/ask/{enquiry}"
+
     # recorders
     def recorder_status(self, recorder: str = "*") -> str:
         """Put every second: RecorderStatus."""
         return f"{self.root}/recorder/{recorder}/status"
+
+    def recorder_trigger(self, recorder: str = "*") -> str:
+        """Put: Trigger, something happened that is worth keeping. Recorder `every`: for all of them."""
+        return f"{self.root}/recorder/{recorder}/trigger"
+
+    def recorder_incident(self, recorder: str) -> str:
+        """Only in logs, never put: Incident, what made the recorder keep what it has."""
+        return f"{self.root}/recorder/{recorder}/incident"
+
+    def recorder_view(self, recorder: str, robot: str, what: str) -> str:
+        """Only in logs, never put: a robot's `pose`, `transform` or `location` in Foxglove's schemas."""
+        return f"{self.root}/recorder/{recorder}/robot/{robot}/{what}"
 
     def recorder_gap(self, recorder: str) -> str:
         """Only in logs, never put: Gap, the messages that are missing there."""

@@ -62,10 +62,29 @@ MOST_DIRECT = 32 * 1024
 """Larger messages are sent in fragments, and one that is dropped loses all."""
 
 
+WRONG_DOOR = "the question is not for this"
+
+
+def mark(key: str, *, direct: bool) -> bytes:
+    """The attachment of a question: for which key it is."""
+    return (MARK if direct else b"") + key.encode()
+
+
+def read_mark(query: zenoh.Query) -> tuple[bool, bytes]:
+    """Whether a question is direct, and the key it is for; empty where it does not say."""
+    raw = query.attachment.to_bytes() if query.attachment is not None else b""
+    return raw.startswith(MARK), raw.removeprefix(MARK)
+
+
+def asker_of(query: zenoh.Query) -> str:
+    """The session that a question says it is of; "" where it does not say."""
+    source = query.source_info
+    return str(source.source_id.zid) if source is not None else ""
+
+
 def is_direct(query: zenoh.Query) -> bool:
     """Whether the answer to a question never blocks."""
-    mark = query.attachment
-    return mark is not None and mark.to_bytes().startswith(MARK)
+    return read_mark(query)[0]
 
 
 def reply_direct(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None) -> None:

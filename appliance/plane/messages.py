@@ -37,6 +37,8 @@ class RecordAsk(Struct, frozen=True, omit_defaults=True):
 
     key: str
     quorum: bool = False
+    replica: bool = False
+    """From whichever replica answers first, which may be behind its owner; one that is asked here if it is one."""
 
 
 class RecordChange(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -13,10 +13,12 @@ from msgspec import Struct
 
 from appliance.errors import ConfigError, SwiftbotError, UnreachableError
 from appliance.plane.bounded import BoundedMembership
+from appliance.plane.browsing import Browsing
 from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
 from appliance.plane.pulse import Pulse
+from appliance.plane.quorum.forgetting import Forgetting
 from appliance.plane.quorum.voting import Voting
 from appliance.plane.reconcile import Reconciler
 from appliance.plane.registry import Registry
@@ -34,6 +36,9 @@ STORE_FILE = "gateway.sqlite"
 AWAY_S = 60.0
 """A gateway that was away for longer may have missed much, and fetches it before the others hand it requests; one that
 was restarted has nearly all, and is back sooner without."""
+BACK_S = 0.25
+"""How long the rest of a gateway's start waits for its shard to be compared: several times what that takes among few.
+Somebody who is seen and does not answer must not hold it up."""
 MOST_ASKED = 3
 ASK_TIMEOUT_S = 0.5
 """One that is busy for longer is no help: what is linked directly counts then."""
@@ -65,6 +70,7 @@ class Plane:
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
         self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
+        self._forgetting = Forgetting(self._voting, gateway=gateway, store=store, kept_hours=config.tombstone_hours)
         self.dht = Dht(
             config,
             gateway=gateway,
@@ -74,6 +80,7 @@ class Plane:
             pulse=self._pulse,
             voting=self._voting,
         )
+        Browsing(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, dht=self.dht)
         self._reconciler = Reconciler(
             config,
             gateway=gateway,
@@ -90,6 +97,7 @@ class Plane:
         """When, on this machine's monotonic clock, `session` and `store` were open; `linked` to somebody; `present`: it
         knew who is there; `fetched` what it will own; `joined`: the others can see it; `reconciled`: it answers for its
         keys with its shard compared."""
+        self._back = asyncio.Event()
         self._away_s = 0.0
         """For how long nothing was written here before."""
         self.dht.on_ring_change.append(lambda: self._reached("reconciled"))
@@ -99,6 +107,7 @@ class Plane:
             return
         self.milestones[milestone] = now = time.monotonic()
         if milestone == "reconciled":
+            self._back.set()
             opened = self.milestones.get("session", now)
             after_ms = {
                 f"{name}_ms": round((at - opened) * 1e3, 2) for name, at in self.milestones.items() if at > opened
@@ -133,9 +142,19 @@ class Plane:
             raise
         return plane
 
+    async def until_back(self, timeout_s: float = BACK_S) -> bool:
+        """Wait until this gateway answers for its keys with its shard compared; False when that takes longer.
+
+        Whatever else a gateway starts competes with that for the event loop, and nobody asks for it before.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._back.wait()
+        return self._back.is_set()
+
     async def _join(self) -> None:
         membership = self._membership
-        await self._voting.start(lost=self.store.set_aside is not None)
+        await self._voting.voter.start(lost=self.store.set_aside is not None)
         if self.config.connect:
             await self._first_link()
         self._reached("linked")
@@ -161,6 +180,8 @@ class Plane:
         membership.join()
         self._reached("joined")
         self._reconciler.start()
+        if self.gateway in self.config.voters:
+            self._forgetting.start()
         log.info("joined", gateway=self.gateway, members=sorted(membership.members))
 
     async def _first_link(self) -> None:
@@ -225,6 +246,7 @@ class Plane:
         await self._membership.leave()
         self._membership.close()
         await self._reconciler.close()
+        await self._forgetting.close()
         await self.dht.close()
         await self.registry.close()
         self.rpc.close()
@@ -295,6 +317,11 @@ class PlaneClient:
             await client.close()
             raise
         return client
+
+    @property
+    def ring(self) -> Ring:
+        """The ring of the gateways that are there just now, if they have as many virtual nodes as configured here."""
+        return self._membership.ring
 
     def members(self) -> frozenset[str]:
         """Ids of the gateways that are there."""

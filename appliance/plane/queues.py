@@ -115,6 +115,11 @@ class Outbox:
             self._some.notify()
         return True
 
+    @property
+    def waiting(self) -> int:
+        """Sends that wait."""
+        return len(self._waiting)
+
     def _run(self) -> None:
         while True:
             with self._some:

@@ -40,6 +40,8 @@ _GATHER_S = 0.02
 """For so long a newcomer gathers members before it asks for their facts."""
 _SPEAK_S = 0.2
 """For so long a newcomer is given to tell its own facts, and longer in a large fleet, at random."""
+_SOON_S = (0.05, 0.15)
+"""After so long a member of a small fleet asks another that has come, drawn, so that they do not all ask at once."""
 _AT_ONCE = 8
 _PAGE_BYTES = 2**20
 _DOUBT_S = 1.0
@@ -212,7 +214,8 @@ class Registry:
             self._asked_by.pop(gateway, None)
         # A speaker's clock may be off, and it may lie: no fact is from the future.
         self._as_of[gateway] = time.monotonic() - max(0.0, age_s)
-        self._missing.discard(gateway)
+        if status.containers <= len(self.containers.get(gateway, ())):
+            self._missing.discard(gateway)  # otherwise it has put some of its containers before we listened
         self._tell("gateway")
 
     def _on_container(self, key: str, info: ContainerInfo | None) -> None:
@@ -253,7 +256,8 @@ class Registry:
                 session.subscribe_typed(keys.container(gateway), ContainerInfo, self._on_container),
             )
         if len(self._membership.members) <= FEW:
-            self._ask(gateway)
+            # One that has only just come has better to do, and tells its own facts besides.
+            self._ask(gateway, after_s=0.0 if self._gateway is None else random.uniform(*_SOON_S))  # noqa: S311
             return
         self._missing.add(gateway)
         if self._catching_up is None:
@@ -306,9 +310,10 @@ class Registry:
                 continue  # what was heard directly is newer
             self._take_containers(gateway, known.containers)
             self._learn_status(gateway, status, age_s=known.age_ms / 1e3)
+            self._missing.discard(gateway)
 
-    def _ask(self, gateway: str) -> None:
-        task = asyncio.create_task(self._ask_facts(gateway), name=f"facts of {gateway}")
+    def _ask(self, gateway: str, *, after_s: float = 0.0) -> None:
+        task = asyncio.create_task(self._ask_facts(gateway, after_s), name=f"facts of {gateway}")
         self._asking[gateway] = task
         task.add_done_callback(lambda done: self._asked(gateway, done))
 
@@ -316,7 +321,8 @@ class Registry:
         if self._asking.get(gateway) is done:
             del self._asking[gateway]
 
-    async def _ask_facts(self, gateway: str) -> None:
+    async def _ask_facts(self, gateway: str, after_s: float) -> None:
+        await asyncio.sleep(after_s)
         for attempt in range(_FACTS_TRIES):
             heard = self._heard.get(gateway, 0)
             try:
@@ -339,6 +345,7 @@ class Registry:
             # All that it holds was in the answer, told before or not.
             status = replace(facts.status, untold_ms=0)
             self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
+        self._missing.discard(gateway)
 
     def _take_containers(self, gateway: str, containers: tuple[ContainerInfo, ...]) -> None:
         self._drop_ages(gateway)

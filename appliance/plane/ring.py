@@ -5,6 +5,7 @@ while the membership is known whole.
 """
 
 import hashlib
+import threading
 from bisect import bisect_left
 from collections.abc import Iterable
 from functools import lru_cache
@@ -15,6 +16,9 @@ RING_BITS = 160
 RING_SIZE = 2**RING_BITS
 _FEW = 8
 """Members that come or go at once; beyond so many a ring made anew is as cheap as one changed."""
+
+_MOST_RECENT = 8
+_LOCK = threading.Lock()
 
 
 def position(text: str) -> int:
@@ -50,6 +54,18 @@ class Ring:
         """The ring of other members; one that differs in a few is made from this one, which is cheaper."""
         if members == self.members:
             return self
+        with _LOCK:
+            known = _recent.get((members, self.virtual_nodes))
+        if known is not None:
+            return known
+        made = self._changed_to(members)
+        with _LOCK:
+            _recent[members, self.virtual_nodes] = made
+            while len(_recent) > _MOST_RECENT:
+                del _recent[next(iter(_recent))]
+        return made
+
+    def _changed_to(self, members: frozenset[str]) -> "Ring":
         came, went = members - self.members, self.members - members
         if len(came) + len(went) > _FEW:
             return Ring(members, virtual_nodes=self.virtual_nodes)
@@ -100,6 +116,15 @@ class Ring:
                 break
         return tuple(found)
 
+    def shares(self) -> dict[str, float]:
+        """Return the share of all positions that each gateway owns, 0 to 1; they add up to 1."""
+        found = dict.fromkeys(self.members, 0)
+        for index, name in enumerate(self.names):
+            # A virtual node owns what lies after the one before it; a single one owns all.
+            alone = len(self.points) == 1
+            found[name] += RING_SIZE if alone else (self.points[index] - self.points[index - 1]) % RING_SIZE
+        return {name: length / RING_SIZE for name, length in found.items()}
+
     def with_member(self, name: str) -> "Ring":
         """The ring once that gateway has joined."""
         return self.changed_to(self.members | {name})
@@ -107,3 +132,7 @@ class Ring:
     def without_member(self, name: str) -> "Ring":
         """The ring once that gateway has left."""
         return self.changed_to(self.members - {name})
+
+
+_recent: dict[tuple[frozenset[str], int], Ring] = {}
+"""Rings made last: the same one is wanted by everybody in this process that hears of a change."""

@@ -9,38 +9,59 @@ gives up after the lease, when Zenoh takes the other side for dead as well.
 
 import asyncio
 import contextlib
+import ipaddress
 import os
 import socket
 import stat
-import time
+from collections.abc import Set
+from typing import Any, ClassVar
+from urllib.parse import urlsplit
 
 EVERY_S = 0.5
 """How often new sockets are looked for, half a lease: a link that hangs at once is let go before it is missed. A look
 takes 0.1 to 0.3 ms."""
 
 CALM_S = 10.0
-"""Least time between two resets: where one does not help, a second at once would only do harm."""
+"""Least time before a link is broken again: where once does not help, a second time at once would only do harm."""
+
+Address = tuple[str, int]
+"""IP address and port."""
 
 
 class SocketWatch:
     """Sets the time limit on every TCP socket of this process. `lease_ms`: after which unacknowledged data ends it."""
 
+    _running: ClassVar[dict[asyncio.AbstractEventLoop, "SocketWatch"]] = {}
+    """One for all sessions of a loop: each look is at the sockets of the whole process."""
+
     def __init__(self, lease_ms: int) -> None:
+        self._users = 0
         self._lease_ms = lease_ms
         self._known: dict[int, int] = {}
         """Descriptor -> inode of the sockets that have been looked at."""
         self._task: asyncio.Task[None] | None = None
-        self._reset_at = -CALM_S
 
-    def start(self) -> None:
-        """Begin to look; also at listening sockets, from which accepted ones inherit it."""
-        self.look()
-        self._task = asyncio.create_task(self._keep_looking(), name="socket watch")
+    @classmethod
+    def shared(cls, lease_ms: int) -> "SocketWatch":
+        """The watch of the running loop's sessions, the shortest lease of theirs; each closes it when it ends."""
+        loop = asyncio.get_running_loop()
+        watch = cls._running.get(loop)
+        if watch is None:
+            watch = cls._running[loop] = cls(lease_ms)
+            watch._task = asyncio.create_task(watch._keep_looking(), name="socket watch")
+        elif lease_ms < watch._lease_ms:
+            watch._lease_ms, watch._known = lease_ms, {}
+        watch._users += 1
+        # Also at listening sockets, from which accepted ones inherit it.
+        with contextlib.suppress(OSError):
+            watch.look()
+        return watch
 
     async def _keep_looking(self) -> None:
         while True:
             await asyncio.sleep(EVERY_S)
-            self.look()
+            with contextlib.suppress(OSError):  # no descriptor is left to list them with: next time
+                self.look()
 
     def look(self) -> int:
         """Set it on the sockets that are new; returns on how many."""
@@ -61,11 +82,10 @@ class SocketWatch:
         return changed
 
     def _set(self, number: int) -> bool:
-        try:
-            copy = os.dup(number)
-        except OSError:
+        handle = _taken(number)
+        if handle is None:
             return False
-        with socket.socket(fileno=copy) as handle:
+        with handle:
             if handle.family not in (socket.AF_INET, socket.AF_INET6) or handle.type != socket.SOCK_STREAM:
                 return False
             try:
@@ -74,26 +94,62 @@ class SocketWatch:
                 return False
         return True
 
-    def reset(self) -> int:
-        """Break every TCP connection of this process, so that both ends forget what they knew; returns how many.
+    def shut(self, ends: Set[tuple[Address, Address]]) -> int:
+        """Break the TCP connections with these (local, remote) ends and no others; returns how many.
 
-        Zenoh makes its links anew at once. Other connections (to a language model, to a vehicle) break too and are
-        made anew by whoever uses them: so this is for links that are known to be mixed up, and at most each `CALM_S`.
+        Zenoh makes its links anew at once.
         """
-        now = time.monotonic()
-        if now < self._reset_at + CALM_S:
-            return 0
-        self._reset_at = now
+        with contextlib.suppress(OSError):
+            self.look()
         broken = 0
         for number in self._known:
-            with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as handle:
-                if handle.family in (socket.AF_INET, socket.AF_INET6) and handle.type == socket.SOCK_STREAM:
-                    handle.getpeername()  # a listening socket has none, and is left alone
+            handle = _taken(number)
+            if handle is None:
+                continue
+            with contextlib.suppress(OSError), handle:
+                if handle.family not in (socket.AF_INET, socket.AF_INET6) or handle.type != socket.SOCK_STREAM:
+                    continue
+                # A listening socket has no other end: the question for it raises.
+                if (_address(handle.getsockname()), _address(handle.getpeername())) in ends:
                     handle.shutdown(socket.SHUT_RDWR)
                     broken += 1
         return broken
 
     def close(self) -> None:
-        """Look no more."""
-        if self._task is not None:
+        """One session less; look no more once there is none."""
+        self._users -= 1
+        if self._users == 0 and self._task is not None:
             self._task.cancel()
+            self._running.pop(self._task.get_loop(), None)
+
+
+def _taken(number: int) -> socket.socket | None:
+    """A descriptor's socket, by a copy of the descriptor; None when it is none any more.
+
+    Zenoh's threads close sockets at any time, and the number may be a file's by now.
+    """
+    try:
+        copy = os.dup(number)
+    except OSError:
+        return None
+    try:
+        return socket.socket(fileno=copy)
+    except OSError:
+        os.close(copy)
+        return None
+
+
+def address_of(locator: str) -> Address | None:
+    """The address in a Zenoh locator such as `tcp/127.0.0.1:7447`; None for one that is no address."""
+    try:
+        parts = urlsplit(f"//{locator.partition('/')[2].partition('?')[0].partition('#')[0]}")
+        return None if parts.hostname is None or parts.port is None else _address((parts.hostname, parts.port))
+    except ValueError:
+        return None
+
+
+def _address(name: Any) -> Address:
+    """A socket's name as an address; IPv4 in an IPv6 socket is IPv4. ValueError when it is none."""
+    host = ipaddress.ip_address(str(name[0]).partition("%")[0])
+    mapped = host.ipv4_mapped if isinstance(host, ipaddress.IPv6Address) else None
+    return str(mapped or host), int(name[1])

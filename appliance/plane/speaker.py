@@ -180,7 +180,12 @@ class Speaker:
 def tells_more(before: GatewayStatus, after: GatewayStatus) -> bool:
     """Whether a status says more than slightly other figures. Pure."""
     same = replace(
-        after, cpu_percent=before.cpu_percent, memory_mb=before.memory_mb, load=before.load, age_ms=before.age_ms
+        after,
+        cpu_percent=before.cpu_percent,
+        memory_mb=before.memory_mb,
+        load=before.load,
+        age_ms=before.age_ms,
+        planner=before.planner,
     )
     return same != before or abs(after.load - before.load) >= LOAD_STEP
 

@@ -9,20 +9,19 @@ import asyncio
 import contextlib
 import sqlite3
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
-import msgspec
 import structlog
 
 from appliance.errors import RefusedError
-from appliance.model import VersionVector
+from appliance.plane.ahead import NOTHING, Ahead, Mark
 from appliance.plane.file import File, problem_of
 from appliance.plane.picture import Picture
+from appliance.plane.rows import COLUMNS, from_row, prefixed, put_row, read_row
 from appliance.plane.versions import Record, digest
 
 log = structlog.get_logger(__name__)
@@ -40,6 +39,7 @@ class _Call(NamedTuple):
     """Told on the store's thread, after the commit."""
     writes: bool
     durable: bool
+    mark: Mark = NOTHING
 
 
 class Store:
@@ -56,6 +56,7 @@ class Store:
         self._picture = Picture()
         self._changed: list[Record | str] = []
         """What the open transaction has put (records) and dropped (keys)."""
+        self._ahead = Ahead()
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
         self._opened: asyncio.Future[None] = loop.create_future()
 
@@ -102,13 +103,15 @@ class Store:
 
         await self._call(run, writes=True)
 
-    async def delete(self, key: str) -> None:
-        """Forget a key; no error when there is none."""
-        await self._execute("DELETE FROM kept WHERE key = ?", key)
+    async def delete(self, key: str, *, only: bytes | None = None) -> bool:
+        """Forget a key, if it is there and (`only`) has just that value; returns whether it was forgotten."""
+        where, values = ("", (key,)) if only is None else (" AND value = ?", (key, only))
+        sql = f"DELETE FROM kept WHERE key = ?{where}"  # noqa: S608 - one of two texts of ours
+        return await self._call(lambda db: db.execute(sql, values).rowcount > 0, writes=True)
 
     async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
         """Return (key, value) of every key with that prefix, in order."""
-        where, bounds = _prefixed(prefix)
+        where, bounds = prefixed(prefix)
         return await self._read(f"SELECT key, value FROM kept {where} ORDER BY key", *bounds)  # noqa: S608
 
     # --- records ----------------------------------------------------------------------------------------------
@@ -123,7 +126,7 @@ class Store:
         return record if known else await self._call(partial(self._read_record, key))
 
     def _read_record(self, key: str, db: sqlite3.Connection) -> Record | None:
-        record = _record(db, key)
+        record = read_row(db, key)
         # Within a transaction it may be one that is not committed.
         if record is not None and not db.in_transaction:
             self._picture.read(record)
@@ -131,9 +134,9 @@ class Store:
 
     async def records(self, prefix: str) -> list[Record]:
         """Return every record with that prefix, tombstones too, in order of keys."""
-        where, bounds = _prefixed(prefix)
-        rows = await self._read(f"SELECT {_COLUMNS} FROM records {where} ORDER BY key", *bounds)  # noqa: S608
-        return [_from_row(row) for row in rows]
+        where, bounds = prefixed(prefix)
+        rows = await self._read(f"SELECT {COLUMNS} FROM records {where} ORDER BY key", *bounds)  # noqa: S608
+        return [from_row(row) for row in rows]
 
     async def digests(self) -> list[tuple[str, str]]:
         """Return (key, digest) of every record, in order of keys."""
@@ -147,31 +150,71 @@ class Store:
         `decide` runs on the store's thread and must be pure: it may be run again. What it raises is raised here.
         Returns what it returned; nothing is written when that is None or what is stored already.
         """
-        return await self._call(partial(self._change, key, decide), writes=True, durable=durable)
+        return await self._call(
+            partial(self._change, key, decide), writes=True, durable=durable, mark=Mark(touches=key)
+        )
 
     def change_soon(
         self, key: str, decide: Callable[[Record | None], Record | None], *, durable: bool = True
     ) -> tuple[asyncio.Future[Record | None], asyncio.Future[Record | None]]:
         """Do the same; returns what was decided, as soon as it is, and the same once it is committed.
 
-        The two fail alike; when only the second does, the decision was made and the disk did not take it.
+        The decision is made here and now where the record's present state is known in memory and nothing is queued that
+        may change it; otherwise on the store's thread in its turn. The two fail alike; when only the second does, the
+        decision was made and the disk did not take it.
         """
         decided: asyncio.Future[Record | None] = self._loop.create_future()
         committed: asyncio.Future[Record | None] = self._loop.create_future()
         # Who awaits the first need not look at the second when that has failed.
         committed.add_done_callback(_looked_at)
 
+        def done(record: Record | None, error: Exception | None) -> None:
+            self._post(decided, record, error)
+            self._post(committed, record, error)
+
+        with self._some:
+            if self._decide_now(key, decide, decided, committed, durable=durable):
+                return decided, committed
+
         def run(db: sqlite3.Connection) -> Record | None:
             record = self._change(key, decide, db)
             self._post(decided, record, None)
             return record
 
-        def done(record: Record | None, error: Exception | None) -> None:
-            self._post(decided, record, error)
-            self._post(committed, record, error)
-
-        self._submit(_Call(run, done, writes=True, durable=durable))
+        self._submit(_Call(run, done, writes=True, durable=durable, mark=Mark(touches=key)))
         return decided, committed
+
+    def _decide_now(
+        self,
+        key: str,
+        decide: Callable[[Record | None], Record | None],
+        decided: asyncio.Future[Record | None],
+        committed: asyncio.Future[Record | None],
+        *,
+        durable: bool,
+    ) -> bool:
+        """Decide on the caller's thread, which has the lock; False where the store's thread has to."""
+        found = None if self._closing else self._ahead.known(key, self._picture.look)
+        if found is None:
+            return False
+        try:
+            record = decide(found.record)
+        except Exception as error:  # noqa: BLE001 - a decision's own error is its caller's, whatever it is
+            if found.on_its_way:
+                return False  # whoever is told of a conflict must be able to read what it is with
+            for each in (decided, committed):
+                each.set_exception(error)
+            return True
+        if record is None or record == found.record:
+            if found.on_its_way:
+                return False  # acknowledged only with the commit of what it found done
+            for each in (decided, committed):
+                each.set_result(record)
+            return True
+        done, mark = partial(self._post, committed), Mark(decided=record)
+        self._submit(_Call(partial(self._put, record), done, writes=True, durable=durable, mark=mark))
+        decided.set_result(record)
+        return True
 
     def change_then(
         self,
@@ -186,7 +229,9 @@ class Store:
         Raises:
             RefusedError: the store is closed, or too much waits for the disk.
         """
-        self._submit(_Call(partial(self._change, key, decide), done, writes=True, durable=durable))
+        self._submit(
+            _Call(partial(self._change, key, decide), done, writes=True, durable=durable, mark=Mark(touches=key))
+        )
 
     def _change(
         self, key: str, decide: Callable[[Record | None], Record | None], db: sqlite3.Connection
@@ -194,20 +239,13 @@ class Store:
         current = self._current(key, db)
         decided = decide(current)
         if decided is not None and decided != current:
-            db.execute(
-                "INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (
-                    key,
-                    decided.value,
-                    msgspec.json.encode(decided.version).decode(),
-                    decided.deleted,
-                    decided.write,
-                    digest(decided),
-                    time.time_ns(),
-                ),
-            )
-            self._changed.append(decided)
+            self._put(decided, db)
         return decided
+
+    def _put(self, record: Record, db: sqlite3.Connection) -> Record:
+        put_row(db, record)
+        self._changed.append(record)
+        return record
 
     def _current(self, key: str, db: sqlite3.Connection) -> Record | None:
         """The record as the open transaction sees it."""
@@ -218,7 +256,7 @@ class Store:
             elif change.key == key:
                 return change
         known, record = self._picture.look(key)
-        return record if known else _record(db, key)
+        return record if known else read_row(db, key)
 
     async def forget(self, record: Record) -> None:
         """Drop a copy that belongs elsewhere, if it is still that version."""
@@ -232,7 +270,7 @@ class Store:
         def run(db: sqlite3.Connection) -> None:
             self._changed += [row[0] for row in db.execute(sql, values).fetchall()]
 
-        await self._call(run, writes=True, durable=durable)
+        await self._call(run, writes=True, durable=durable, mark=Mark(touches=""))
 
     # --- the thread -------------------------------------------------------------------------------------------
 
@@ -242,9 +280,12 @@ class Store:
     async def _execute(self, sql: str, *values: Any, durable: bool = True) -> None:
         await self._call(lambda db: db.execute(sql, values) and None, writes=True, durable=durable)
 
-    async def _call(self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True) -> T:
+    async def _call(
+        self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True,
+        mark: Mark = NOTHING,
+    ) -> T:  # fmt: skip
         future: asyncio.Future[Any] = self._loop.create_future()
-        self._submit(_Call(run, partial(self._post, future), writes, durable))
+        self._submit(_Call(run, partial(self._post, future), writes, durable, mark))
         return cast("T", await future)
 
     def _submit(self, call: _Call) -> None:
@@ -256,6 +297,7 @@ class Store:
                     f"{len(self._waiting)} calls wait for the disk", remedy="the disk is too slow or fails"
                 )
             self._waiting.append(call)
+            self._ahead.queued(call.mark)
             self._some.notify()
 
     def _run(self) -> None:
@@ -291,11 +333,18 @@ class Store:
             problem = problem_of(error, self.path)
             log.error("the store failed", path=str(self.path), reason=str(problem))  # noqa: TRY400 - cause named
             outcomes = [(None, problem)]
+        self._settle(batch)
         for call, (result, error) in zip(batch, outcomes, strict=True):
             try:
                 call.done(result, error)
             except Exception:  # supervision boundary: one caller's defect must not end the thread of all
                 log.exception("who waited for the store failed")
+
+    def _settle(self, batch: list[_Call]) -> None:
+        """What these calls did, or failed to, shows in the picture: they stand in no decision's way any more."""
+        with self._some:
+            for call in batch:
+                self._ahead.settled(call.mark)
 
     def _commit(self, db: sqlite3.Connection, batch: list[_Call]) -> list[tuple[Any, Exception | None]]:
         writes = any(call.writes for call in batch)
@@ -358,30 +407,6 @@ class Store:
         await asyncio.to_thread(self._thread.join)
 
 
-_COLUMNS = "key, value, version, deleted, write"
-
-
-def _record(db: sqlite3.Connection, key: str) -> Record | None:
-    row = db.execute(f"SELECT {_COLUMNS} FROM records WHERE key = ?", (key,)).fetchone()  # noqa: S608
-    return None if row is None else _from_row(row)
-
-
-def _from_row(row: tuple[str, bytes, str, int, str]) -> Record:
-    key, value, version, deleted, write = row
-    return Record(
-        key=key,
-        value=value,
-        version=msgspec.json.decode(version, type=VersionVector),
-        deleted=bool(deleted),
-        write=write,
-    )
-
-
 def _looked_at(future: asyncio.Future[Record | None]) -> None:
     if not future.cancelled():
         future.exception()
-
-
-def _prefixed(prefix: str) -> tuple[str, tuple[str, ...]]:
-    """The condition for keys of a prefix, so that the index serves it; code points end at U+10FFFF."""
-    return ("WHERE key >= ? AND key < ?", (prefix, prefix + "\U0010ffff")) if prefix else ("", ())

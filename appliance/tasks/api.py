@@ -6,19 +6,20 @@ verbs. Requests refuse unknown fields, so that a typing error is an error and no
 
 from msgspec import Struct
 
-from appliance.llm.settings import TierAttempt
-from appliance.model import ContainerInfo, Plan, RunEvent, TaskRecord
+from appliance.llm.analysis import Analysis
+from appliance.llm.experience.statistic import Row
+from appliance.model import ContainerInfo, Plan, RunEvent, TaskRecord, TierAttempt
 from appliance.tasks.watch.lines import Line
 
 
 class TaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`task` and `cancel`: which task."""
+    """`task`: which task."""
 
     id: str
 
 
 class AgreeAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`agree`, `agree_here`: an operator's word on the plan that is proposed for a task after a failure."""
+    """`agree`: an operator's word on whatever plan of a task waits; `approve` and `reject` say more."""
 
     id: str
     agree: bool = True
@@ -59,6 +60,8 @@ class PlanAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """`plan`: decompose, run nothing."""
 
     instruction: str
+    private: bool = False
+    """The text must not leave the asked gateway."""
 
 
 class PlanAnswer(Struct, frozen=True, kw_only=True):
@@ -66,6 +69,24 @@ class PlanAnswer(Struct, frozen=True, kw_only=True):
 
     plan: Plan
     attempts: tuple[TierAttempt, ...] = ()
+    analysis: Analysis | None = None
+    """What it asks for: parameters with units, constraints, who can do it, which containers it will need."""
+
+
+class ExperienceAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`experience`: how have skills done on robots lately, by what this gateway has heard?"""
+
+    limit: int = 200
+
+
+class ExperienceList(Struct, frozen=True, kw_only=True):
+    """The least reliable pairs of skill and robot first, and the thresholds that experience has moved."""
+
+    gateway: str
+    rows: tuple[Row, ...]
+    thresholds: dict[str, float] = {}
+    """Tier -> confidence from which its plan is taken."""
+    confirm_below: float = 0.0
 
 
 class RunAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -102,6 +123,10 @@ class WhyAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     id: str
     subtask: str = ""
     here: bool = False
+
+
+class SiteAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`site`: what do names of places mean here? Answered with the Site."""
 
 
 class SkillsAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

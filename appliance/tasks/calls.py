@@ -1,4 +1,4 @@
-"""What a handler may ask of the appliance while it runs: robot commands, notices, files.
+"""What a handler may ask of the appliance while it runs: robot commands, notices, questions to people, files.
 
 Every effect has the id `task/subtask/n`, n being the number of the call within the handler, the same in a
 repeated attempt; whoever carries it out does it once per id. So a gateway that dies between doing and
@@ -15,20 +15,29 @@ from typing import Any, cast
 import msgspec
 import structlog
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError, RobotError, SwiftbotError, from_code
 from appliance.model import Notice, RobotCommand, RobotReply, encode
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.pool.pool import Call
+from appliance.robots.bounds import CHOSEN
 from appliance.robots.commands import send_command
 from appliance.tasks.api import ArtifactAsk, ArtifactPiece
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.bounds import MAX_RUN_S, clean
+from appliance.tasks.steering.enquiries import Enquiries, enquiry_of
 
 log = structlog.get_logger(__name__)
 
+Orders = Callable[[str, RobotCommand, frozenset[str], bool], RobotCommand]
+
 _NOT_A_NAME = re.compile(r"[^a-z0-9_.-]")
+HEARD_S = 0.5
+"""How long after a command was cancelled a soft stop may still be on its way here."""
+ANSWER_S = 240.0
+"""How long people are waited for when a handler does not say."""
 BUSY_RETRY_S = 0.5
 """Pause before a busy robot is asked again."""
 
@@ -36,7 +45,30 @@ BUSY_RETRY_S = 0.5
 class Calls:
     """Carries out handlers' calls on one gateway."""
 
-    def __init__(self, plane: Plane, artifacts: Artifacts, *, on_wait: Callable[[Call, str], None]) -> None:
+    def __init__(
+        self,
+        plane: Plane,
+        artifacts: Artifacts,
+        *,
+        on_wait: Callable[[Call, str], None],
+        hindrance: Callable[[str], str] = lambda _: "",
+        enquiries: Enquiries | None = None,
+        orders: Orders = lambda _, command, __, ___: command,
+    ) -> None:
+        """Make them.
+
+        Args:
+            plane: the fleet.
+            artifacts: files of handlers.
+            on_wait: told what a call waits for.
+            hindrance: why a robot may not be commanded just now, "" when it may.
+            enquiries: takes questions to people.
+            orders: returns an order as it may be sent to a robot, given the arguments that no plan asked for and
+                whether an earlier attempt may have begun it; raises a SwiftbotError with the reason when it may not be.
+        """
+        self._orders = orders
+        self._enquiries = enquiries
+        self._hindrance = hindrance
         self._plane = plane
         self._artifacts = artifacts
         self._on_wait = on_wait
@@ -48,6 +80,8 @@ class Calls:
                 return await self._command(call)
             case "notify":
                 return await self._notify(call)
+            case "ask":
+                return await self._ask(call)
             case "put_artifact":
                 return await self._put(call)
             case "get_artifact":
@@ -68,12 +102,20 @@ class Calls:
         command = RobotCommand(
             id=_effect(call), verb=verb, args=args, task=run.task, subtask=run.subtask, attempt=run.attempt
         )
+        # The same id of an earlier attempt: a robot that drives it already is joined, one that has done it answers.
+        begun = run.attempt > 1 or run.resume is not None
         give_up = time.monotonic() + timeout_s
         while True:
+            await self._until_free(call, run.robot, give_up)
+            # What the robot and its site allow may have changed meanwhile, and so may where it is.
+            sent = self._orders(run.robot, command, CHOSEN - run.params.keys(), begun)
             left = give_up - time.monotonic()
-            reply = await send_command(self._plane.session, run.robot, command, timeout_s=max(0.1, left))
+            reply = await send_command(self._plane.session, run.robot, sent, timeout_s=max(0.1, left))
             if reply.failure is None:
                 return _answer(reply)
+            if reply.failure.code == "cancelled" and await self._was_stopped(run.robot):
+                # Its task hears of the stop or lease as well, and ends this run; its next attempt does the rest.
+                await self._until_free(call, run.robot, give_up)
             if reply.failure.code != "busy" or left <= BUSY_RETRY_S:
                 error = from_code(reply.failure.code, reply.failure.message, reply.failure.remedy)
                 if type(error) is SwiftbotError:
@@ -81,6 +123,23 @@ class Calls:
                 raise error
             self._on_wait(call, f"waits for {run.robot}: {reply.failure.message}")
             await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _until_free(self, call: Call, robot: str, give_up: float) -> None:
+        """Wait while a robot is stopped or an operator has it; RobotError when that lasts too long."""
+        while why := self._hindrance(robot):
+            if time.monotonic() >= give_up:
+                raise RobotError(f"{robot} is {why}", remedy="the task goes on when that is over")
+            self._on_wait(call, f"waits for {robot}: {why}")
+            await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _was_stopped(self, robot: str) -> bool:
+        """Whether a command was ended by a soft stop or a lease, of which the robot may have heard first."""
+        until = time.monotonic() + HEARD_S
+        while not self._hindrance(robot):
+            if time.monotonic() >= until:
+                return False
+            await asyncio.sleep(0.02)
+        return True
 
     async def _notify(self, call: Call) -> dict[str, Any]:
         effect = _effect(call)
@@ -108,6 +167,21 @@ class Calls:
         except ConflictError:
             log.info("notice was settled by another attempt", effect=effect)
         return {"notice": effect, "to": notice.to}
+
+    async def _ask(self, call: Call) -> dict[str, Any]:
+        if self._enquiries is None:
+            raise PayloadError("this gateway takes no questions to people")
+        args = call.args
+        enquiry = enquiry_of(
+            _effect(call),
+            question=args.get("question"),
+            choices=args.get("choices") or [],
+            to=args.get("to", "operator"),
+            expires_s=_timeout(args.get("timeout_s", ANSWER_S)),
+        )
+        asked = replace(enquiry, robot=call.run.robot or "")
+        answered = await self._enquiries.ask(asked, on_wait=lambda note: self._on_wait(call, note))
+        return {"answer": answered.answer or "", "by": answered.by}
 
     async def _put(self, call: Call) -> dict[str, Any]:
         data = call.args.get("data", b"")

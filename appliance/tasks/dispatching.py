@@ -112,6 +112,7 @@ class Dispatching:
                 **figures(self._around.plane, gateway),
             )
         )
+        self._around.sent(keeper.record, target, placement)
         self._orders.add(gateway, request)
 
     def move(self, news: MoveReady) -> None:

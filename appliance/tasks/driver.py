@@ -7,7 +7,7 @@ the task: this driver reads again and, unless the key is its own, stops. So two 
 same attempt.
 
 Here are the loop and its inbox; the parts are `planning`, `dispatching`, `hearing` (news of runs), `checking` with the
-`monitor`, and `replanning`, around the `keeper` of the record.
+`monitor`, `replanning` and `steering` (operators' orders), around the `keeper` of the record.
 """
 
 import asyncio
@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import structlog
 
+from appliance.errors import UnreachableError
 from appliance.model import Failure, RunEventKind, SubtaskState, TaskRecord, TaskState, VersionVector
 from appliance.tasks import machine
 from appliance.tasks.checking import Checking
@@ -31,14 +32,16 @@ from appliance.tasks.pace import Pace
 from appliance.tasks.planning import plan_it
 from appliance.tasks.replanning import Replanning
 from appliance.tasks.soundness import Unknown
+from appliance.tasks.steering.driving import Steering
 from appliance.tasks.surroundings import (
-    Agreement,
     CancelAsked,
     GatewayLost,
     Input,
     MoveReady,
     PlanMade,
+    RunHeld,
     RunNews,
+    Steered,
     Surroundings,
     Wake,
 )
@@ -48,8 +51,10 @@ log = structlog.get_logger(__name__)
 LOOK_AHEAD_S = 5.0
 """How often what comes is worked out anew while no subtask changes."""
 _LEAST = (RunEventKind.PROGRESS, RunEventKind.PARTIAL, RunEventKind.CHECKPOINT)
-_NEVER_LEFT = (CancelAsked, PlanMade, Agreement)
+_NEVER_LEFT = (CancelAsked, PlanMade, Steered, RunHeld)
 """News that are few and that no check would find out."""
+_TIMED = (TaskState.RUNNING, TaskState.PROPOSED)
+"""States in which a deadline or an operator ends a task by a transition; while it is planned, planning is ended."""
 MAX_INBOX = 1000
 """News that may wait for a driver; beyond it progress is dropped, beyond twice that what checks find out anyway."""
 
@@ -86,6 +91,7 @@ class Driver:
         self._dispatching = Dispatching(*parts, self._pace, self._replanning)
         self._monitor = Monitor(*parts, self._dispatching)
         self._checking = Checking(*parts, self._monitor)
+        self._steering = Steering(around, self._keeper, self._orders, self._pace, self.tell)
         self._hinted_states: tuple[SubtaskState, ...] = ()
         self._hint_at = 0.0
 
@@ -148,6 +154,9 @@ class Driver:
             log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
         finally:
             self._replanning.close()
+            self._steering.close()
+            for news in self._left():
+                news.refuse(UnreachableError("the task's coordination has ended here", remedy="ask again"))
             self._orders.close()
 
     async def _next(self) -> Input:
@@ -164,7 +173,7 @@ class Driver:
             *self._pace.not_before.values(), self._checking.next_at, *(() if partial_at is None else (partial_at,))
         )  # fmt: skip
         due = [at - now for at in wake_at if at > now]
-        if self.record.state is TaskState.RUNNING:
+        if self.record.state in _TIMED:
             due.append(left_s(self.record, self._keeper.elapsed_s))
         return max(0.01, min([self._around.config.check_s, *due]))
 
@@ -172,13 +181,16 @@ class Driver:
         """Take the task over if another gateway coordinated it, ask after its runs, and plan it if need be."""
         keeper, healing = self._keeper, heal(self.record)
         if self.record.sequence > 1 or self.record.coordinator != self._around.plane.gateway:
+            before, began = self.record.coordinator, time.monotonic()
             keeper.apply(keeper.transition(TransitionKind.ADOPTED))
             await keeper.flush()
+            wrote_ms = round((time.monotonic() - began) * 1e3, 1)
+            log.info("task adopted", task=self.record.id, before=before, wrote_ms=wrote_ms)
         if healing is not None:
             await healing.settle(self._around.plane, keeper)
             for each in healing.superseded:
                 self._hearing.attempt_failed(self.record.of(each), OVERTAKEN, None)
-        if self._give_up is not None and self.record.state in (TaskState.ACCEPTED, TaskState.RUNNING):
+        if self._give_up is not None and self.record.state in (TaskState.ACCEPTED, *_TIMED):
             kind = TransitionKind.CANCEL if self.record.subtasks else TransitionKind.PLAN_FAILED
             keeper.apply(keeper.transition(kind, failure=self._give_up))
         await self._checking.ask_after(machine.active(self.record))
@@ -188,8 +200,9 @@ class Driver:
     def _advance(self) -> None:
         """Do what follows from the record."""
         now = time.monotonic()
-        if self.record.state is TaskState.RUNNING and left_s(self.record, self._keeper.elapsed_s) <= 0:
+        if self.record.state in _TIMED and left_s(self.record, self._keeper.elapsed_s) <= 0:
             self._keeper.apply(self._keeper.transition(TransitionKind.CANCEL, failure=passed(self.record)))
+        self._steering.advance()
         if self.record.state is not TaskState.CANCELLING:
             self._hearing.tell_partials(now)
         self._replanning.advance(now)
@@ -201,20 +214,32 @@ class Driver:
                 await self._hearing.hear(event)
             case GatewayLost(gateway):
                 self._hearing.gateway_lost(gateway)
-            case CancelAsked():
-                if self.record.state is TaskState.RUNNING:
-                    self._keeper.apply(self._keeper.transition(TransitionKind.CANCEL))
+            case CancelAsked(word):
+                if self.record.state in (TaskState.RUNNING, TaskState.PROPOSED):
+                    self._keeper.apply(self._keeper.transition(TransitionKind.CANCEL, word=word))
             case MoveReady():
                 self._dispatching.move(news)
             case PlanMade():
                 self._replanning.take_up(news)
-            case Agreement():
-                self._replanning.agree(news)
+            case Steered():
+                self._steering.take(news)
+            case RunHeld():
+                self._steering.run_held(news)
             case Wake():
                 self._pace.look_again()
 
+    def _left(self) -> list[Steered]:
+        """Orders of operators that came too late to be looked at."""
+        left: list[Steered] = []
+        while not self._inbox.empty():
+            news = self._inbox.get_nowait()
+            if isinstance(news, Steered):
+                left.append(news)
+        return left
+
     def _written(self) -> None:
         self._orders.go()
+        self._steering.written()
         self._look_ahead(time.monotonic())
 
     def _look_ahead(self, now: float) -> None:

@@ -83,6 +83,8 @@ def _waits(
             )
         case _:
             pass
+    if record.paused:
+        return Waits(reason=record.paused)
     place = scheduler.line.place_of((record.id, name), time.monotonic())
     robot, reason = scheduler.bind(record, target) if target.subtask.robot else (None, "")
     try:

@@ -68,6 +68,8 @@ class Healing(Struct, frozen=True, kw_only=True):
     """Subtasks of the version that stands whose run is to be repeated under a higher number."""
     notes: tuple[str, ...]
     """What people are told; none where nothing was doubled."""
+    noted: tuple[str, ...]
+    """Which version each note is about: whoever settles it, it is the same notice."""
 
     async def settle(self, plane: Plane, keeper: Keeper) -> None:
         """Write it into the record, then end what is doubled and tell people."""
@@ -75,9 +77,9 @@ class Healing(Struct, frozen=True, kw_only=True):
         await keeper.flush()
         task = keeper.record.id
         await asyncio.gather(*(_end(plane, task, run) for run in self.ends))
-        for number, note in enumerate(self.notes):
+        for name, note in zip(self.noted, self.notes, strict=True):
             notice = Notice(
-                id=f"{task}/healed/{keeper.record.sequence}-{number}",
+                id=f"{task}/healed/{name}",
                 to=NOTICED,
                 text=note,
                 task=task,
@@ -107,6 +109,7 @@ def heal(record: TaskRecord) -> Healing | None:
     superseded: set[str] = set()
     settled: list[Split] = []
     notes: list[str] = []
+    noted: list[str] = []
     for split in fresh:
         doubled: list[str] = []
         for run in split.runs:
@@ -128,6 +131,7 @@ def heal(record: TaskRecord) -> Healing | None:
                 MAX_NOTE,
             )
             notes.append(note)
+            noted.append(f"{split.coordinator}-{split.sequence}")
         settled.append(replace(split, settled=True, note=note))
     others = tuple(each for each in record.splits if each.settled)
     return Healing(
@@ -136,6 +140,7 @@ def heal(record: TaskRecord) -> Healing | None:
         ends=tuple(ends.values()),
         superseded=tuple(sorted(superseded)),
         notes=tuple(notes),
+        noted=tuple(noted),
     )
 
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import msgspec
 
-from appliance.errors import NotFoundError
+from appliance.errors import NotFoundError, TakenError
 from appliance.model import Failure, RunEvent, RunEventKind, SubtaskRecord, SubtaskState, TaskState
 from appliance.tasks import machine
-from appliance.tasks.bounds import tidy
+from appliance.tasks.bounds import MAX_NOTE, clean, tidy
 from appliance.tasks.healing import foreign
 from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
@@ -17,6 +17,9 @@ from appliance.tasks.pace import Pace
 from appliance.tasks.partials import Partials, shown
 from appliance.tasks.replan.decide import worth_replanning
 from appliance.tasks.surroundings import Surroundings
+
+TAKEN_PAUSE_S = 2.0
+"""Before the next attempt with a robot that was taken over at the vehicle."""
 
 
 class Hearing:
@@ -114,6 +117,8 @@ class Hearing:
                         failure, code="orphaned", message=f"ended there, though its task goes on: {failure.message}",
                         retryable=True,
                     )  # fmt: skip
+                if failure.code == TakenError.code and self._wait_for_robot(target, failure):
+                    return
                 self.attempt_failed(target, failure, event.duration_ms, event=event)
             case RunEventKind.PARTIAL:
                 self._partials.add(event)
@@ -122,6 +127,20 @@ class Hearing:
                 keeper.take(keeper.transition(TransitionKind.CHECKPOINT, **common), durable=not target.checkpoint_ns)
             case RunEventKind.LOG | RunEventKind.ALIVE:
                 pass
+
+    def _wait_for_robot(self, target: SubtaskRecord, failure: Failure) -> bool:
+        """Let a subtask wait whose robot a pilot or a failsafe has taken: nothing is wrong with it or its attempt.
+
+        It goes on with the next attempt when the robot is given back; until then nobody commands it.
+        """
+        keeper = self._keeper
+        note = clean(f"waits for {target.bound_robot or 'its robot'}: {failure.message}", MAX_NOTE)
+        held = keeper.transition(TransitionKind.HELD, subtask=target.subtask.id, attempt=target.attempt, note=note)
+        if not keeper.take(held):
+            return False
+        # The roster hears of it with the next heartbeat; a new attempt before that would meet the same refusal.
+        self._pace.repeats(target.subtask.id, time.monotonic() + TAKEN_PAUSE_S)
+        return True
 
     def gateway_lost(self, gateway: str) -> None:
         """End the attempts on a gateway that is gone."""
@@ -142,7 +161,8 @@ class Hearing:
         keeper = self._keeper
         judged = _with_failure(target, failure)
         leaves = target.subtask.id in self.gives_way
-        give_up = leaves or machine.gives_up(judged, failure, retries=self._retries(target) + 1)
+        retries = self._retries(target)
+        give_up = leaves or machine.gives_up(judged, failure, retries=retries + 1)
         replan = leaves or worth_replanning(failure.code)
         taken = keeper.take(
             keeper.transition(
@@ -152,6 +172,7 @@ class Hearing:
                 gateway=target.gateway,
                 failure=failure,
                 give_up=give_up,
+                retries=None if leaves else retries,
                 replan=give_up and replan and keeper.record.state is TaskState.RUNNING,
                 duration_ms=duration_ms,
                 cpu_ms=event.cpu_ms if event else None,

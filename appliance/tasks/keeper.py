@@ -55,6 +55,11 @@ class Keeper:
         """A transition that is written was published."""
 
     @property
+    def version(self) -> VersionVector:
+        """The record's version as it was written last."""
+        return self._version
+
+    @property
     def elapsed_s(self) -> float:
         """Seconds since the task was accepted: those that the record carries, and those since it was taken up here."""
         return time.monotonic() - self._since

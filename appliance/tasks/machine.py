@@ -10,6 +10,9 @@ order, so that folding the logged ones over nothing must give the record that wa
        └──plan failed──►     └──cancel──► cancelling ──runs ended──► cancelled
           failed
 
+A plan that an operator has to approve makes the task `proposed` first; `steering.transitions` has that, pauses, and
+how a task that has ended is tried again.
+
 A subtask: waiting → ready → dispatched → running → succeeded; an attempt that failed and may be repeated goes
 back to ready with the next attempt number; results of other attempts than the current one are stale. One that is
 given up with `replan` leaves its task running until its plan is revised (`revising`) or cannot be.
@@ -28,6 +31,7 @@ from appliance.model import (
     TaskState,
 )
 from appliance.tasks import revising
+from appliance.tasks.steering import transitions as steering
 from appliance.tasks.transition import StaleTransitionError, Transition, TransitionKind
 
 
@@ -57,6 +61,7 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
             note=event.note,
             plan=event.plan,
             handed_in=event.plan is not None,
+            approval=event.approval,
             coordinator=event.coordinator,
             created_ns=event.at_ns,
             updated_ns=event.at_ns,
@@ -66,7 +71,7 @@ def apply(record: TaskRecord | None, event: Transition) -> TaskRecord:
         raise StaleTransitionError(f"transition of task {event.task} applied to {record.id}")
     if event.sequence != record.sequence + 1:
         raise StaleTransitionError(f"sequence {event.sequence} after {record.sequence}")
-    if record.state.final and event.kind is not TransitionKind.HEALED:
+    if record.state.final and event.kind not in _AFTER_THE_END:
         raise StaleTransitionError(f"task {record.id} has already {record.state}")
     handler = _HANDLERS.get(event.kind)
     if handler is None:
@@ -93,18 +98,13 @@ def fits(record: TaskRecord, event: Transition) -> bool:
 def _planned(record: TaskRecord, event: Transition) -> TaskRecord:
     if record.state is not TaskState.ACCEPTED or event.plan is None:
         raise StaleTransitionError(f"a plan for task {record.id}, which is {record.state}")
-    subtasks = tuple(
-        SubtaskRecord(subtask=subtask, state=SubtaskState.WAITING if subtask.after else SubtaskState.READY)
-        for subtask in event.plan.subtasks
-    )
-    note = event.note or record.note
-    return replace(record, state=TaskState.RUNNING, plan=event.plan, subtasks=subtasks, note=note)
+    return steering.begun(replace(record, note=event.note or record.note), event.plan)
 
 
 def _plan_failed(record: TaskRecord, event: Transition) -> TaskRecord:
-    if record.state not in (TaskState.ACCEPTED, TaskState.CANCELLING):
+    if record.state not in (TaskState.ACCEPTED, TaskState.PROPOSED, TaskState.CANCELLING):
         raise StaleTransitionError(f"no plan for task {record.id}, which is {record.state}")
-    return replace(record, state=TaskState.FAILED, failure=event.failure)
+    return replace(record, state=TaskState.FAILED, failure=event.failure, proposal=None)
 
 
 def _adopted(record: TaskRecord, _: Transition) -> TaskRecord:
@@ -119,8 +119,8 @@ def _grouped(record: TaskRecord, event: Transition) -> TaskRecord:
 
 def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
     target = _subtask(record, event)
-    if record.state is not TaskState.RUNNING or target.state is not SubtaskState.READY:
-        raise StaleTransitionError(f"dispatch of {event.subtask}, which is {target.state}")
+    if record.state is not TaskState.RUNNING or target.state is not SubtaskState.READY or record.pauses:
+        raise StaleTransitionError(f"dispatch of {event.subtask}, which is {record.paused or target.state}")
     if event.attempt != target.next_attempt:
         raise StaleTransitionError(f"attempt {event.attempt} of {event.subtask}, which is at {target.attempt}")
     return _with(
@@ -307,7 +307,10 @@ def _cancel(record: TaskRecord, event: Transition) -> TaskRecord:
     """Stop everything; with a `failure` it is the appliance that gives the task up, not a person."""
     if record.state is TaskState.CANCELLING:
         raise StaleTransitionError(f"task {record.id} is being cancelled already")
-    return _stop_rest(replace(record, state=TaskState.CANCELLING, failure=event.failure))
+    proposal = None if record.state is TaskState.PROPOSED else record.proposal
+    return _stop_rest(
+        replace(record, state=TaskState.CANCELLING, failure=event.failure, cancelled_by=event.word, proposal=proposal)
+    )
 
 
 def _stop_rest(record: TaskRecord) -> TaskRecord:
@@ -328,7 +331,7 @@ def _settle(record: TaskRecord) -> TaskRecord:
     if record.state is TaskState.RUNNING:
         done = {each.subtask.id for each in record.subtasks if each.state is SubtaskState.SUCCEEDED}
         subtasks = tuple(
-            replace(each, state=SubtaskState.READY)
+            replace(each, state=SubtaskState.READY, note=record.paused or each.note)
             if each.state is SubtaskState.WAITING and done.issuperset(each.subtask.after)
             else each
             for each in record.subtasks
@@ -381,16 +384,17 @@ _HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] 
     TransitionKind.NOTICED: revising.noticed,
     TransitionKind.REBOUND: revising.revised,
     TransitionKind.SUBSTITUTED: revising.revised,
-    TransitionKind.PROPOSED: revising.proposed,
     TransitionKind.AGREED: revising.agreed,
     TransitionKind.REPLANNED: revising.revised,
     TransitionKind.REPLAN_FAILED: revising.replan_failed,
+    **steering.HANDLERS,
 }
+_AFTER_THE_END = (TransitionKind.HEALED, TransitionKind.RETRIED)
 
 
 def ready(record: TaskRecord) -> tuple[SubtaskRecord, ...]:
-    """Subtasks that may be dispatched now."""
-    if record.state is not TaskState.RUNNING:
+    """Subtasks that may be dispatched now; none while the task is paused."""
+    if record.state is not TaskState.RUNNING or record.pauses:
         return ()
     return tuple(each for each in record.subtasks if each.state is SubtaskState.READY)
 
@@ -414,8 +418,8 @@ def gives_up(target: SubtaskRecord, failure: Failure, *, retries: int) -> bool:
     """
     if not failure.retryable:
         return True
-    own = [a for a in target.attempts if a.failure and a.failure.code not in _NOT_ITS_FAULT]
-    # An attempt that was moved away has no failure: it counts for neither.
+    # Attempts that were moved away or held count for neither, nor those before an operator had it tried again.
+    own = [a for a in target.attempts if a.failure and not a.left and a.failure.code not in _NOT_ITS_FAULT]
     others = sum(not a.left for a in target.attempts) - len(own)
     if failure.code in _NOT_ITS_FAULT:
         return others >= MAX_DISPLACEMENTS

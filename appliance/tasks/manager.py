@@ -7,9 +7,7 @@ all there is to takeover: a dead coordinator's tasks are driven by the next owne
 """
 
 import asyncio
-import contextlib
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 
 import structlog
@@ -19,16 +17,13 @@ from appliance.errors import (
     ConflictError,
     DeadlineError,
     NotFoundError,
-    PayloadError,
     PlanError,
-    SwiftbotError,
     UnreachableError,
 )
 from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import PlanContext
 from appliance.llm.validate import validate
 from appliance.model import (
-    Failure,
     Group,
     Plan,
     RunAccepted,
@@ -38,44 +33,46 @@ from appliance.model import (
     SubtaskRecord,
     TaskRecord,
     TaskRequest,
-    VersionVector,
+    TaskState,
     encode,
 )
-from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
 from appliance.tasks.admission import Ends, checked, expectation, full, longest_s
-from appliance.tasks.agreeing import Agreeing
-from appliance.tasks.api import PlanAnswer, PlanAsk, SkillsAsk, TaskAsk, TaskList, TasksAsk, WhyAsk
-from appliance.tasks.bounds import MAX_TEXT, clean, read_record
+from appliance.tasks.api import (
+    ExperienceAsk,
+    ExperienceList,
+    PlanAnswer,
+    PlanAsk,
+    SkillsAsk,
+    TaskAsk,
+    TasksAsk,
+    WhyAsk,
+)
+from appliance.tasks.bounds import clean
 from appliance.tasks.checkpoints import Checkpoint, read_checkpoint, remove_checkpoint
 from appliance.tasks.deadline import Ages
 from appliance.tasks.driver import Driver
+from appliance.tasks.driving import Driving
 from appliance.tasks.executor import Executor
-from appliance.tasks.explaining import explain
-from appliance.tasks.healing import heal, unheard
-from appliance.tasks.keeper import Keeper
 from appliance.tasks.line import Place
-from appliance.tasks.listing import newest_tasks
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement
-from appliance.tasks.recovery import Recovery
+from appliance.tasks.questions import Questions
+from appliance.tasks.recovery import Recovery, rest_of
+from appliance.tasks.replan.splice import problems
 from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.soundness import unknown, unsound
-from appliance.tasks.surroundings import CancelAsked, GatewayLost, RunNews, Wake, task_key
-from appliance.tasks.why import TaskWhy, why
+from appliance.tasks.steering.api import CancelTaskAsk, PlanCheckAsk, PlanChecked
+from appliance.tasks.steering.audit import Audit
+from appliance.tasks.steering.deciding import needs_approval
+from appliance.tasks.steering.hashing import plan_hash
+from appliance.tasks.steering.verbs import OperatorVerbs
+from appliance.tasks.surroundings import FREE, Commands, GatewayLost, RunNews, Wake, task_key
 
 log = structlog.get_logger(__name__)
-
-SWEEP_S = 15.0
-"""How often the shard is looked through when the ring stands still."""
-MAX_BREAKS = 6
-"""Drivers of one task that may break before it is ended with the reason; with the pauses, half a minute."""
-AGAIN_S = (0.5, 1.5, 4.0)
-"""When the shard is looked through again after the ring has changed."""
 
 
 class TaskManager:
@@ -91,22 +88,21 @@ class TaskManager:
         executor: Executor,
         site: Site,
         image_of: Callable[[str], str] = lambda _: "",
+        commands: Commands = FREE,
+        audit: Audit | None = None,
     ) -> None:
         self.config = config
         self.plane = plane
+        self.commands = commands
+        self._audit = audit or Audit(plane.session, plane.keys, plane.gateway)
         self._catalogue = catalogue
         self._decomposer = decomposer
         self._executor = executor
         self._site = site
-        self._drivers: dict[str, Driver] = {}
-        self._driving: dict[str, asyncio.Task[None]] = {}
-        self._breaks: Counter[str] = Counter()
-        """How often a task's driver has broken; each time it is left alone for longer, in the end given up."""
-        self._why: dict[str, Failure] = {}
-        """Why the last driver of a task broke."""
-        self._healing: dict[str, asyncio.Task[None]] = {}
-        self._final: dict[str, VersionVector] = {}
-        """Records of the shard known to be final, which need not be decoded at every sweep."""
+        self._ages = Ages()
+        self._ends = Ends()
+        self._driving = Driving(self, ages=self._ages, moved=self._moved, ended=self._has_ended, changed=self._tell)
+        self._drivers, self._sweep = self._driving.drivers, self._driving.sweep
         self.scheduler = Scheduler(
             plane,
             catalogue,
@@ -114,11 +110,15 @@ class TaskManager:
             records=lambda: [driver.record for driver in self._drivers.values()],
             wake=self._wake,
             image_of=image_of,
+            hindrance=commands.hindrance,
+            shuns=decomposer.memory.experience.shuns,
         )
-        self._ages = Ages()
-        self._ends = Ends()
         self._ahead = LookAhead(
-            plane, manifest=self.manifest, likely_place=self.scheduler.likely_place, tell_here=executor.hint
+            plane,
+            manifest=self.manifest,
+            likely_place=self.scheduler.likely_place,
+            tell_here=executor.hint,
+            experience_s=decomposer.memory.experience.expected_s,
         )
         self.recovery = Recovery(
             plane,
@@ -128,10 +128,12 @@ class TaskManager:
             durations=self._ahead.durations,
             busy=self.scheduler.busy_robots,
         )
+        questions = Questions(
+            plane, self._drivers, scheduler=self.scheduler, durations=self._ahead.durations, sweep=self._sweep
+        )
+        self.task, self.tasks, self.why = questions.task, questions.tasks, questions.why
+        self.cancel, self.cancel_here = questions.cancel, questions.cancel_here
         self._closers: list[Callable[[], None]] = []
-        self._stopping = False
-        self._sweep = asyncio.Event()
-        self._sweeper: asyncio.Task[None] | None = None
         self.on_change: Callable[[], None] = lambda: None
 
     @property
@@ -146,23 +148,29 @@ class TaskManager:
         rpc.register("submit", TaskRequest, self.submit)
         rpc.register("accept", TaskRequest, self.accept)
         rpc.register("plan", PlanAsk, self.plan_only)
+        rpc.register("experience", ExperienceAsk, self.experience)
         rpc.register("task", TaskAsk, self.task)
         rpc.register("tasks", TasksAsk, self.tasks)
-        rpc.register("cancel", TaskAsk, self.cancel)
-        rpc.register("cancel_here", TaskAsk, self.cancel_here)
+        rpc.register("plan_check", PlanCheckAsk, self.plan_check)
+        rpc.register("cancel", CancelTaskAsk, self._audit.signed("cancel", self.cancel))
+        rpc.register("cancel_here", CancelTaskAsk, self.cancel_here)
         rpc.register("why", WhyAsk, self.why)
         rpc.register("skills", SkillsAsk, self.scheduler.skills)
-        Agreeing(self.plane, self._drivers, self.task).register()
+        OperatorVerbs(
+            self.plane,
+            self._drivers,
+            task=self.task,
+            drive=self._driving.drive,
+            published=self.recovery.published,
+            audit=self._audit,
+        ).register()
         news = self.plane.session.subscribe_typed(self.plane.keys.run(), RunEvent, self._on_run_event)
         self._closers.append(news.close)
         self._closers.append(self.plane.session.subscribe(self.plane.keys.task(), self._ages.hear).close)
         self.plane.on_member_lost.append(self._on_member_lost)
-        self.plane.dht.on_ring_change.append(self._sweep.set)
-        self.plane.dht.on_ring_change.append(self._sweep_soon)
         self.plane.registry.on_change.append(self._on_fact)
         await self._ahead.durations.load()
-        self._sweeper = asyncio.create_task(self._keep_sweeping(), name="task takeover")
-        self._sweep.set()
+        self._driving.start()
 
     async def settle(self, deadline_s: float) -> None:
         """Wait until the ends of this gateway's own runs, which is draining, stand in the records driven here.
@@ -175,13 +183,9 @@ class TaskManager:
 
     async def stop(self) -> None:
         """Stop driving; the records stay, and the next owner of each key goes on."""
-        self._stopping = True
         for close in self._closers:
             close()
-        tasks = [each for each in (self._sweeper, *self._driving.values(), *self._healing.values()) if each]
-        for each in tasks:
-            each.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._driving.close()
         await self._ahead.close()
         await self.scheduler.close()
 
@@ -235,6 +239,7 @@ class TaskManager:
             deadline_s=request.deadline_s,
             within=request.group,
             plan=request.plan,
+            approval=request.approval,
             note=self.expect(request.plan, deadline_s=request.deadline_s),
         )
         record = machine.apply(None, transition)
@@ -248,129 +253,22 @@ class TaskManager:
         self.recovery.published(transition)
         self.plane.session.put(self.plane.keys.task(record.id), encode(record))
         log.info("task accepted", task=record.id, instruction=record.instruction)
-        self._drive(record, version)
+        self._driving.drive(record, version)
         return record
 
     # --- driving --------------------------------------------------------------------------------------------
-
-    def _drive(self, record: TaskRecord, version: VersionVector, value: bytes = b"") -> None:
-        if record.id in self._drivers or self._stopping:
-            return
-        give_up = self._why.get(record.id) if self._breaks[record.id] >= MAX_BREAKS else unsound(record)
-        if give_up is not None and value and self._breaks[record.id] < MAX_BREAKS:
-            self.plane.session.refuse("unsound task record", task=record.id, reason=give_up.message)
-        driver = Driver(
-            self,
-            record,
-            version,
-            on_change=self._moved,
-            give_up=give_up,
-            elapsed_s=self._ages.elapsed_s(record),
-            unknown=unknown(value) if value else None,
-        )
-        self._drivers[record.id] = driver
-        task = asyncio.create_task(driver.run(), name=f"drive {record.id}")
-        self._driving[record.id] = task
-        task.add_done_callback(lambda done: self._driven(driver, done))
-        self.on_change()
 
     def _moved(self, record: TaskRecord) -> None:
         self.scheduler.moved(record)
         self.on_change()
 
-    def _driven(self, driver: Driver, done: asyncio.Task[None]) -> None:
-        self._drivers.pop(driver.record.id, None)
+    def _tell(self) -> None:
+        self.on_change()
+
+    def _has_ended(self, driver: Driver) -> None:
         self.scheduler.forget(driver.record.id)
         if driver.ended:
             self._ends.ended(time.monotonic())
-        self._driving.pop(driver.record.id, None)
-        task = driver.record.id
-        if not done.cancelled() and (error := done.exception()) is not None:
-            # The record stands as it was last written: a new driver takes it up from there.
-            log.error("driver broke", task=task, exc_info=error)
-            if not isinstance(error, UnreachableError | DeadlineError):
-                self._breaks[task] += 1
-                what = error.message if isinstance(error, SwiftbotError) else f"{type(error).__name__}: {error}"
-                self._why[task] = Failure(code="internal", message=clean(f"driving it broke: {what}", MAX_TEXT))
-        if driver.ended or self._stopping:
-            self._breaks.pop(task, None)
-            self._why.pop(task, None)
-            log.info("task ended" if driver.ended else "task is handed over", task=task, state=str(driver.record.state))
-        else:
-            pause_s = min(30.0, 0.5 * 2 ** self._breaks[task])
-            asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
-        self.on_change()
-
-    async def _keep_sweeping(self) -> None:
-        """Take up what is ours when the ring changes, and now and then in any case.
-
-        A task can be accepted by a gateway that learns a moment later that the key is another's: without the
-        regular look its owner, who has swept before the record came, would never drive it.
-        """
-        while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(SWEEP_S):
-                    await self._sweep.wait()
-            self._sweep.clear()
-            try:
-                await self._take_up()
-            except Exception as error:  # without takeover a lost gateway's tasks would hang: it must not die
-                log.exception("takeover is tried again", reason=str(error))
-                asyncio.get_running_loop().call_later(1.0, self._sweep.set)
-
-    async def _take_up(self) -> None:
-        """Drive the unfinished tasks of the shard that are owned here; let go of those that are not."""
-        for task_id, driving in list(self._driving.items()):
-            if not self.plane.dht.owns(task_key(task_id)):
-                driving.cancel()
-        final: dict[str, VersionVector] = {}
-        for stored in await self.plane.dht.local("task/"):
-            if stored.deleted or not self.plane.dht.owns(stored.key):
-                continue
-            if self._final.get(stored.key) == stored.version:
-                final[stored.key] = stored.version
-                continue
-            try:
-                record = read_record(stored.value)
-            except PayloadError as error:
-                log.warning("task record cannot be read", key=stored.key, reason=str(error))
-                continue
-            if task_key(record.id) != stored.key:
-                # Driven under the name it gives itself it would be written over another task's record.
-                reason = f"it is of {record.id[:80]!r}"
-                self.plane.session.refuse("misplaced task record", key=stored.key, reason=reason)
-                final[stored.key] = stored.version
-                continue
-            if record.state.final:
-                final[stored.key] = stored.version
-                self._heal_ended(record, stored.version)
-            elif record.id not in self._drivers:
-                self._drive(record, stored.version, stored.value)
-            elif unheard(record, self._drivers[record.id].record):
-                # Two coordinators have met: whoever drives by the version before goes on from the merged one.
-                self._driving[record.id].cancel()
-                self._sweep_soon()
-        self._final = final
-
-    def _heal_ended(self, record: TaskRecord, version: VersionVector) -> None:
-        """Tell what became of a task that had been ended on one side of a partition and went on on the other."""
-        healing = heal(record)
-        if healing is None or record.id in self._healing or self._stopping:
-            return
-        keeper = Keeper(self.plane, record, version, lambda _: None)
-        work = asyncio.create_task(healing.settle(self.plane, keeper), name=f"heal {record.id}")
-        self._healing[record.id] = work
-        work.add_done_callback(lambda done: self._healed(record.id, done))
-
-    def _healed(self, task: str, done: asyncio.Task[None]) -> None:
-        self._healing.pop(task, None)
-        if not done.cancelled() and (error := done.exception()) is not None:
-            log.info("what a partition left is settled later", task=task, reason=str(error))
-
-    def _sweep_soon(self) -> None:
-        """Look through the shard again a few times: records of the other side of a partition come bit by bit."""
-        for pause_s in AGAIN_S:
-            asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
 
     def _on_run_event(self, key: str, event: RunEvent | None) -> None:
         if event is None or (driver := self._drivers.get(event.task)) is None:
@@ -389,6 +287,11 @@ class TaskManager:
         if (driver := self._drivers.get(task)) is not None:
             driver.tell(Wake())
 
+    def look_again(self) -> None:
+        """Who may command robots has changed: every driver looks at what that means for its task."""
+        for driver in self._drivers.values():
+            driver.tell(Wake())
+
     def _on_fact(self, kind: str) -> None:
         if kind == "gateway":
             self.scheduler.line.serve(time.monotonic())
@@ -401,20 +304,80 @@ class TaskManager:
 
     async def plan(self, record: TaskRecord) -> Plan:
         """Return the plan handed in with the task if it is valid, else a new one."""
-        robots = tuple(self.plane.registry.robots.values())
+        context = self._context(record.instruction, submitter=record.submitter)
         if record.plan is not None:
-            problems = validate(record.plan, self._catalogue, robots=robots, site=self._site, require_implemented=True)
-            if problems:
+            if problems := self._decomposer.check(record.plan, context):
                 raise PlanError("the plan handed in is not valid", problems=problems)
             return record.plan
-        return (await self.plan_only(PlanAsk(instruction=record.instruction))).plan
+        return (await self._decomposer.plan(context)).plan
+
+    def approval(self, record: TaskRecord, plan: Plan) -> str:
+        """Why a plan has to be approved before it takes effect; "" when it need not be."""
+        wanted = needs_approval(
+            plan,
+            record.approval.stricter(self.config.approval),
+            manifests=self._catalogue.skills,
+            robots=self.plane.registry.robots,
+        )
+        # A person who hands in a plan has seen it; a robot's, or one that was made here, nobody has.
+        doubts: tuple[str, ...] = ()
+        if not record.handed_in:
+            doubts = plan.provenance.confirm if plan.provenance is not None else ()
+        elif record.submitter in self.plane.registry.robots:
+            doubts = self._decomposer.confirm(plan)
+        return "; ".join((*doubts, wanted) if wanted else doubts)
+
+    def plan_problems(self, record: TaskRecord | None, plan: Plan) -> tuple[str, ...]:
+        """What is wrong with a plan just now; of a task that runs, with the continuation that it is."""
+        if record is not None and record.state is TaskState.RUNNING:
+            wrong = validate(plan, self._catalogue) or problems(record, plan, self._catalogue.skills)
+            if wrong:
+                return tuple(wrong)
+            try:
+                plan = rest_of(record, plan)
+            except PlanError as error:
+                return (error.message, *error.problems)
+        submitter, instruction = (record.submitter, record.instruction) if record is not None else ("", "")
+        return self._decomposer.check(plan, self._context(instruction, submitter=submitter))
+
+    async def plan_check(self, ask: PlanCheckAsk) -> PlanChecked:
+        """Answer `plan_check`."""
+        record = await self.task(TaskAsk(id=ask.task)) if ask.task else None
+        wrong = self.plan_problems(record, ask.plan)
+        wanted = self.config.approval.stricter(record.approval) if record is not None else self.config.approval
+        skills, robots = self._catalogue.skills, self.plane.registry.robots
+        approval = "" if wrong else needs_approval(ask.plan, wanted, manifests=skills, robots=robots)
+        return PlanChecked(problems=wrong, hash=plan_hash(ask.plan), approval=approval)
 
     async def plan_only(self, ask: PlanAsk) -> PlanAnswer:
         """Decompose an instruction against the present roster and site; run nothing."""
         instruction = self._check(TaskRequest(instruction=ask.instruction)).instruction
-        robots = tuple(sorted(self.plane.registry.robots.values(), key=lambda robot: robot.id))
-        outcome = await self._decomposer.plan(PlanContext(instruction=instruction, robots=robots, site=self._site))
-        return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts)
+        context = self._context(instruction, private=ask.private)
+        outcome = await self._decomposer.plan(context)
+        analysis = self._decomposer.analyse(context, outcome.plan)
+        return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts, analysis=analysis)
+
+    def _context(self, instruction: str, *, submitter: str = "", private: bool = False) -> PlanContext:
+        """What is known now that bears on an instruction."""
+        roster = self.plane.registry.robots
+        return PlanContext(
+            instruction=instruction,
+            robots=tuple(sorted(roster.values(), key=lambda robot: robot.id)),
+            site=self._site,
+            private=private,
+            submitter=submitter,
+            from_robot=submitter in roster,
+        )
+
+    async def experience(self, ask: ExperienceAsk) -> ExperienceList:
+        """Tell how skills have done on robots lately, by what this gateway has heard."""
+        memory = self._decomposer.memory
+        return ExperienceList(
+            gateway=self.plane.gateway,
+            rows=tuple(memory.experience.rows()[: max(0, ask.limit)]),
+            thresholds=memory.thresholds.all,
+            confirm_below=memory.thresholds.confirm_below,
+        )
 
     def manifest(self, skill: str) -> SkillManifest:
         """Return a skill's manifest; NotFoundError when this gateway does not know it (another may)."""
@@ -435,6 +398,10 @@ class TaskManager:
     def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
         """Order the members of a task's group for a subtask by the coarse score."""
         return self.scheduler.place(record, target, robot)
+
+    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
+        """Tell, for the log, how the gateways stood when a subtask was sent."""
+        self.scheduler.sent(record, target, placement)
 
     def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
         """Return where a ready subtask may go now, or its place among those that wait for room."""
@@ -486,60 +453,3 @@ class TaskManager:
     def driver(self, task: str) -> Driver | None:
         """Return the driver of a task that is coordinated here."""
         return self._drivers.get(task)
-
-    # --- questions --------------------------------------------------------------------------------------------
-
-    async def task(self, ask: TaskAsk) -> TaskRecord:
-        """Return a task's record; NotFoundError when there is none."""
-        if driver := self._drivers.get(ask.id):
-            return driver.told
-        stored = await self.plane.dht.read(task_key(check_name(ask.id, "task")))
-        if stored is None or stored.deleted:
-            raise NotFoundError(f"there is no task {ask.id}", remedy="see `swiftbot task list`")
-        return read_record(stored.value)
-
-    async def why(self, ask: WhyAsk) -> TaskWhy:
-        """Tell why a task waits, or was served where it was; its coordinator knows what is in no record."""
-        if driver := self._drivers.get(ask.id):
-            return await explain(
-                driver.record,
-                ask.subtask,
-                plane=self.plane,
-                scheduler=self.scheduler,
-                durations=self._ahead.durations,
-                elapsed_s=driver.elapsed_s,
-            )
-        record = await self.task(TaskAsk(id=ask.id))
-        owner = self.plane.ring.owner(task_key(ask.id))
-        if not (record.state.final or ask.here or owner == self.plane.gateway):
-            return await self.plane.rpc.call(owner, "why", replace(ask, here=True), TaskWhy)
-        return why(record, ask.subtask)
-
-    async def tasks(self, ask: TasksAsk) -> TaskList:
-        """Return the newest tasks, of the whole fleet or of this gateway's shard."""
-        return await newest_tasks(self.plane, ask, [driver.record for driver in self._drivers.values()])
-
-    async def cancel(self, ask: TaskAsk) -> TaskRecord:
-        """Stop a task wherever it is coordinated; returns its record at that moment."""
-        if ask.id in self._drivers:
-            return await self.cancel_here(ask)
-        record = await self.task(ask)
-        if record.state.final:
-            return record
-        owner = await self.plane.owner_of(task_key(ask.id))
-        if owner == self.plane.gateway:
-            self._sweep.set()
-            return await self.cancel_here(ask)
-        return await self.plane.rpc.call(owner, "cancel_here", ask, TaskRecord)
-
-    async def cancel_here(self, ask: TaskAsk) -> TaskRecord:
-        """Stop a task that is coordinated here; waits a moment for a driver that is being set up."""
-        for _ in range(20):
-            if driver := self._drivers.get(ask.id):
-                driver.tell(CancelAsked())
-                return driver.record
-            record = await self.task(ask)
-            if record.state.final:
-                return record
-            await asyncio.sleep(0.1)
-        raise UnreachableError(f"nobody coordinates task {ask.id} just now", remedy="try again in a second")

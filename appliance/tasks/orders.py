@@ -25,6 +25,7 @@ from appliance.model import (
 )
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.migration.api import Held, HoldAsk
 from appliance.tasks.surroundings import Input, MoveReady, RunNews, Surroundings, deadline_s, need_of
 
 log = structlog.get_logger(__name__)
@@ -35,6 +36,9 @@ way: a run that takes no time can be heard of before it."""
 LEAVE_S = 8.0
 """How long a run that is left may take to end before the next attempt begins elsewhere: its handler's grace, and
 what it changed in volumes being noted. Beyond that it is fenced off by its attempt number alone."""
+
+HOLD_S = 20.0
+"""How long a run may take to come to a point where it can be left: the end of a robot command, a checkpoint."""
 
 
 def request_for(
@@ -151,6 +155,16 @@ class Orders:
         except SwiftbotError as error:
             log.info("no word of a run", run=ask.run_id, gateway=target.gateway, reason=str(error))
             return None
+
+    async def hold(self, target: SubtaskRecord, task: str) -> bool:
+        """Have a run save a checkpoint and send no more commands for a moment; False when it goes on as before."""
+        ask = HoldAsk(task=task, subtask=target.subtask.id, attempt=target.attempt)
+        try:
+            held = await self._around.plane.rpc.call(target.gateway, "run_hold", ask, Held, timeout_s=HOLD_S)
+        except SwiftbotError as error:
+            log.info("a run is not held", task=task, subtask=target.subtask.id, reason=str(error))
+            return False
+        return held.saved or not held.began
 
     def close(self) -> None:
         """Give up what is on its way."""

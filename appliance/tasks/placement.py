@@ -9,7 +9,7 @@ no candidate. Ties go to the gateway that asks: it is a network hop nearer.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from msgspec import Struct
 
@@ -158,6 +158,8 @@ def bind(
     uses: Mapping[str, Sequence[str]],
     verbs: Mapping[str, Sequence[str]],
     busy: frozenset[str],
+    hindrance: Callable[[str], str] = lambda _: "",
+    shuns: Callable[[SubtaskRecord, str], str] = lambda _subtask, _robot: "",
 ) -> tuple[str | None, str]:
     """Choose the robot behind `any`, `any1`, ... or confirm a named one.
 
@@ -168,6 +170,8 @@ def bind(
         uses: subtask id -> actuators it needs.
         verbs: subtask id -> commands it needs.
         busy: robots with a run in progress, chosen last; those of other labels of this task are not chosen.
+        hindrance: why tasks may not command a robot just now: a soft stop, a lease; "" when they may.
+        shuns: why a robot should not be given a subtask while another can do it, by experience; "" if nothing is.
 
     Returns:
         The robot and "", or None and the reason for the wait.
@@ -187,6 +191,8 @@ def bind(
                 asked = (uses.get(each.subtask.id, ()), verbs.get(each.subtask.id, ()))
                 if reason := lacks(robot, *asked):
                     return None, f"waits for {bound}: {reason}"
+        if reason := hindrance(bound):
+            return None, f"waits for {bound}: {reason}"
         return bound, ""
     taken = {each.bound_robot for each in records if each.bound_robot}
     named = {each.subtask.robot for each in records if each.subtask.robot}
@@ -200,5 +206,13 @@ def bind(
     if not able:
         wanted = sorted({use for each in mine for use in uses.get(each.subtask.id, ())})
         return None, f"waits for a robot with {', '.join(wanted) or 'the needed skills'}"
-    able.sort(key=lambda robot: (robot.id in taken or robot.id in named, robot.id in busy, robot.id))
+    hindered = {each.id: reason for each in able if (reason := hindrance(each.id))}
+    if len(hindered) == len(able):
+        return None, "waits for a robot: " + "; ".join(
+            f"{name} is {reason}" for name, reason in sorted(hindered.items())
+        )
+    able = [each for each in able if each.id not in hindered]
+    shunned = {robot.id: any(shuns(each, robot.id) for each in mine if not each.state.final) for robot in able}
+    # One that is busy becomes free; one that keeps failing goes on failing.
+    able.sort(key=lambda robot: (robot.id in taken | named, shunned[robot.id], robot.id in busy, robot.id))
     return able[0].id, ""

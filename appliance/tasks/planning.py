@@ -12,24 +12,36 @@ from appliance.tasks.bounds import clean
 from appliance.tasks.deadline import left_s, passed
 from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
-from appliance.tasks.surroundings import CancelAsked, Input, Surroundings
+from appliance.tasks.surroundings import CancelAsked, Input, Steered, Surroundings
 
 log = structlog.get_logger(__name__)
 
 
 async def plan_it(around: Surroundings, keeper: Keeper, inbox: "asyncio.Queue[Input]") -> None:
-    """Plan the task; whatever comes of it is a transition. News that come meanwhile are of no use and dropped."""
+    """Plan the task; whatever comes of it is a transition.
+
+    Operators' orders that come meanwhile are looked at afterwards; other news are of no use and dropped.
+    """
     planning = asyncio.ensure_future(around.plan(keeper.record))
+    later: list[Input] = []
     try:
         record = keeper.record
-        if await _cancelled_before(planning, inbox, time.monotonic() + left_s(record, keeper.elapsed_s)):
-            keeper.apply(keeper.transition(TransitionKind.CANCEL))
+        until = time.monotonic() + left_s(record, keeper.elapsed_s)
+        if (cancel := await _cancelled_before(planning, inbox, until, later)) is not None:
+            keeper.apply(keeper.transition(TransitionKind.CANCEL, word=cancel.word))
             return
         if not planning.done():
             keeper.apply(keeper.transition(TransitionKind.PLAN_FAILED, failure=passed(record)))
             return
         plan = planning.result()
         note = around.expect(plan, deadline_s=record.deadline_s, elapsed_s=keeper.elapsed_s)
+        if why := around.approval(record, plan):
+            waits = keeper.transition(
+                TransitionKind.PROPOSED, plan=plan, note=clean(why, 500), waits=True,
+                expires_s=around.config.approval_s,
+            )  # fmt: skip
+            keeper.apply(waits)
+            return
         keeper.apply(keeper.transition(TransitionKind.PLANNED, plan=plan, note=note))
     except SwiftbotError as error:
         keeper.apply(keeper.transition(TransitionKind.PLAN_FAILED, failure=_plan_failure(error)))
@@ -39,10 +51,14 @@ async def plan_it(around: Surroundings, keeper: Keeper, inbox: "asyncio.Queue[In
         keeper.apply(keeper.transition(TransitionKind.PLAN_FAILED, failure=failure))
     finally:
         planning.cancel()
+        for news in later:
+            inbox.put_nowait(news)
 
 
-async def _cancelled_before(planning: "asyncio.Future[Plan]", inbox: "asyncio.Queue[Input]", deadline: float) -> bool:
-    """Wait for the plan, until the deadline at most; True if a cancel came first."""
+async def _cancelled_before(
+    planning: "asyncio.Future[Plan]", inbox: "asyncio.Queue[Input]", deadline: float, later: list[Input]
+) -> CancelAsked | None:
+    """Wait for the plan, until the deadline at most; a cancel that came first. `later` gets operators' other orders."""
     while not planning.done() and (left := deadline - time.monotonic()) > 0:
         asking = asyncio.ensure_future(inbox.get())
         try:
@@ -51,11 +67,15 @@ async def _cancelled_before(planning: "asyncio.Future[Plan]", inbox: "asyncio.Qu
                 return_when=asyncio.FIRST_COMPLETED,
                 timeout=None if math.isinf(left) else left,
             )
-            if asking.done() and isinstance(asking.result(), CancelAsked):
-                return True
+            if asking.done():
+                news = asking.result()
+                if isinstance(news, CancelAsked):
+                    return news
+                if isinstance(news, Steered):
+                    later.append(news)
         finally:
             asking.cancel()
-    return False
+    return None
 
 
 def _plan_failure(error: SwiftbotError) -> Failure:

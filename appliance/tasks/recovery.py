@@ -13,6 +13,7 @@ from appliance.model import Plan, Site, SubtaskRecord, SubtaskState, TaskRecord
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks.durations import Durations
+from appliance.tasks.replan.allowed import remainder
 from appliance.tasks.replan.robots import Robots
 from appliance.tasks.replan.splice import problems, splice
 from appliance.tasks.revising import ACTIVE
@@ -61,7 +62,8 @@ class Recovery:
 
     def robots(self) -> Robots:
         """The roster as it is known now."""
-        return Robots(roster=self._plane.registry.robots, busy=self._busy())
+        experience = self._decomposer.memory.experience
+        return Robots(roster=self._plane.registry.robots, busy=self._busy(), shuns=experience.shuns)
 
     def experience(self, skill: str) -> Sequence[float]:
         """How long the last runs of a skill took, seconds."""
@@ -89,8 +91,7 @@ class Recovery:
         Raises:
             PlanError: it cannot; the message says why.
         """
-        robots = tuple(sorted(self._plane.registry.robots.values(), key=lambda robot: robot.id))
-        context = PlanContext(instruction=record.instruction, robots=robots, site=self._site)
+        context = self._context(record)
         manifests = self._catalogue.skills
         outcome = await self._decomposer.replan(
             record,
@@ -99,6 +100,35 @@ class Recovery:
             rest=lambda plan: rest_of(record, plan),
         )
         return outcome.plan
+
+    def against(self, record: TaskRecord, target: SubtaskRecord, plan: Plan, robot: str = "") -> tuple[str, ...]:
+        """Say what a revised plan makes wrong that was not wrong before, by the checks that every plan has to pass.
+
+        Args:
+            record: the task as it stands.
+            target: the subtask that was given up.
+            plan: the task's plan from then on.
+            robot: who takes over from the robot of `target`; "" when nobody does.
+        """
+        context = self._context(record)
+        wrong = self._decomposer.check(remainder(record, target, plan, robot), context)
+        if not wrong:
+            return ()
+        # A robot that has left meanwhile, say, is no reason against what is done about another's failure.
+        before = remainder(record, target, record.plan, "") if record.plan is not None else plan
+        known = frozenset(self._decomposer.check(before, context))
+        return tuple(each for each in wrong if each not in known)
+
+    def _context(self, record: TaskRecord) -> PlanContext:
+        """What is known now that bears on a task, and whose it is: a robot's task stays a robot's."""
+        roster = self._plane.registry.robots
+        return PlanContext(
+            instruction=record.instruction,
+            robots=tuple(sorted(roster.values(), key=lambda robot: robot.id)),
+            site=self._site,
+            submitter=record.submitter,
+            from_robot=record.submitter in roster,
+        )
 
 
 def rest_of(record: TaskRecord, proposed: Plan) -> Plan:

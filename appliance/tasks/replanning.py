@@ -19,11 +19,12 @@ from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
 from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
+from appliance.tasks.replan.allowed import allowed_robot
 from appliance.tasks.replan.decide import AskDecomposer, GiveUp, confirmed, decide
-from appliance.tasks.replan.robots import Rebinding, another_robot, robot_of
+from appliance.tasks.replan.robots import Rebinding, robot_of
 from appliance.tasks.replan.skills import Substitution
 from appliance.tasks.replan.splice import problems, splice
-from appliance.tasks.surroundings import Agreement, Input, PlanMade, Surroundings
+from appliance.tasks.surroundings import Input, PlanMade, Surroundings
 
 log = structlog.get_logger(__name__)
 
@@ -48,7 +49,6 @@ class Replanning:
         self._tell = tell
         self._asking: asyncio.Task[None] | None = None
         self._asked_for = ""
-        self._waits_since: float | None = None
         self._ending_since: float | None = None
         self._end_at: dict[str, float] = {}
 
@@ -60,7 +60,10 @@ class Replanning:
             return
         if record.proposal is not None:
             self._pursue(now)
-        elif self._asking is None:
+            return
+        self._ending_since = None  # of the next proposal's runs nobody was asked to end yet
+        self._end_at.clear()
+        if self._asking is None:
             # Each decision changes the record; the bound of revisions is that of this loop.
             while self._asking is None and (stranded := revising.stranded(self._keeper.record)):
                 self._decide(stranded[0])
@@ -73,13 +76,14 @@ class Replanning:
         if not robot or waited_s < config.robot_wait_s or self._keeper.record.revised >= config.max_revisions:
             return reason
         recovery = self._around.recovery
-        found = another_robot(
+        found = allowed_robot(
             self._keeper.record,
             target,
             f"offline for {waited_s:.0f} s",
             manifests=recovery.manifests,
             robots=recovery.robots(),
             config=config,
+            against=lambda plan, robot: recovery.against(self._keeper.record, target, plan, robot),
         )
         if isinstance(found, Rebinding):
             self._rebind(target, found)
@@ -101,28 +105,24 @@ class Replanning:
         if wrong:
             self._give_up(target, f"the new plan does not fit any more: {'; '.join(wrong[:3])}")
             return
-        # Whoever confirmed a plan before it ran is asked again: this is another one.
-        waits = news.plan.confidence < self._around.config.replan.confirm_below or confirmed(keeper.record)
+        # Whoever confirmed a plan before it ran is asked again, as is the rule for first plans: this is another one.
+        doubts = news.plan.provenance.confirm if news.plan.provenance is not None else ()
+        unsure = news.plan.confidence < self._around.config.replan.confirm_below
+        rule = self._around.approval(keeper.record, news.plan)
+        waits = bool(doubts) or unsure or confirmed(keeper.record) or bool(rule)
+        said = f"planned anew by {news.plan.tier} ({news.plan.confidence:.2f} sure)"
+        if rule:
+            said = f"{said}, to be approved ({rule})"
         keeper.take(
             keeper.transition(
                 TransitionKind.PROPOSED,
                 subtask=news.subtask,
                 plan=news.plan,
                 waits=waits,
-                note=clean(f"planned anew by {news.plan.tier} ({news.plan.confidence:.2f} sure): {news.why}", MAX_NOTE),
+                expires_s=self._around.config.replan.confirm_s if waits else 0.0,
+                note=clean(f"{said}: {news.why}", MAX_NOTE),
             )
         )
-
-    def agree(self, news: Agreement) -> None:
-        """Take an operator's word on what is proposed."""
-        keeper = self._keeper
-        proposal = keeper.record.proposal
-        if proposal is None or not proposal.waits:
-            return
-        if news.agree:
-            keeper.take(keeper.transition(TransitionKind.AGREED, subtask=proposal.subtask, note=news.by))
-        else:
-            self._give_up(keeper.record.of(proposal.subtask), f"{news.by or 'the operator'} turned the new plan down")
 
     def close(self) -> None:
         """Ask no more."""
@@ -140,6 +140,7 @@ class Replanning:
             manifests=recovery.manifests,
             robots=recovery.robots(),
             config=self._around.config.replan,
+            against=lambda plan, robot: recovery.against(keeper.record, target, plan, robot),
         )
         match decision:
             case Rebinding():
@@ -212,8 +213,9 @@ class Replanning:
             return
         target = keeper.record.of(proposal.subtask)
         if proposal.waits:
-            self._waits_since = self._waits_since or now
-            if now - self._waits_since > (limit := self._around.config.replan.confirm_s):
+            # By the task's own age: whoever coordinates it now, the wait began when the plan was proposed.
+            limit = proposal.expires_s or self._around.config.replan.confirm_s
+            if keeper.elapsed_s - proposal.since_s > limit:
                 self._give_up(target, f"no operator agreed to the new plan within {limit:.0f} s")
             return
         spliced = splice(keeper.record, proposal.plan)

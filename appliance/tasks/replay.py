@@ -46,8 +46,8 @@ class ReplayReport(Struct, frozen=True, kw_only=True):
     same: bool = False
 
 
-_TAKES_OVER = (TransitionKind.ADOPTED, TransitionKind.HEALED)
-"""What a coordinator may begin with where another has been: a task that has ended is only healed."""
+TAKES_OVER = (TransitionKind.ADOPTED, TransitionKind.HEALED, TransitionKind.RETRIED)
+"""What a coordinator may begin with where another has been: a task that has ended is only healed, or tried again."""
 
 
 class _Folding:
@@ -64,7 +64,7 @@ class _Folding:
     def take(self, event: Transition) -> None:
         self.transitions += 1
         base = self.record
-        if base is not None and event.coordinator != base.coordinator and event.kind not in _TAKES_OVER:
+        if base is not None and event.coordinator != base.coordinator and event.kind not in TAKES_OVER:
             # Of the other side of a partition, or of one that was succeeded and does not know it yet.
             self.stale += 1
             return

@@ -14,6 +14,7 @@ from appliance.model import LostRun, Split, SubtaskState, TaskRecord, encode
 from appliance.plane.dht import Record
 from appliance.pool import lineage
 from appliance.tasks import checkpoints
+from appliance.tasks.steering import enquiries
 
 MOST_SPLITS = 8
 """Versions that lost and are remembered in the one that stands: a fleet falls into few parts."""
@@ -108,4 +109,6 @@ def resolver(key: str, one: Record, other: Record) -> Record:
         return one if checkpoints.stronger(one.value, other.value) == one.value else other
     if key.startswith(lineage.KEY) and one.deleted == other.deleted:
         return one if lineage.stronger(one.value, other.value) == one.value else other
+    if key.startswith(enquiries.PREFIX) and one.deleted == other.deleted:
+        return one if enquiries.stronger(one.value, other.value) == one.value else other
     return max(one, other, key=lambda record: (record.deleted, record.value))

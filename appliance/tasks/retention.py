@@ -17,6 +17,7 @@ from appliance.plane.node import Plane
 from appliance.tasks import checkpoints
 from appliance.tasks.bounds import read_record
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.steering import enquiries
 
 log = structlog.get_logger(__name__)
 
@@ -54,6 +55,7 @@ class Retention:
         due = [
             *await self._old_tasks(),
             *await self._orphaned("effect/", ended=False),
+            *await self._orphaned(enquiries.PREFIX, ended=False),
             *await self._orphaned(checkpoints.PREFIX, ended=True),
         ]
         for record in due[:AT_ONCE]:

@@ -29,6 +29,7 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
+from appliance.tasks.steering.hashing import plan_hash
 from appliance.tasks.transition import StaleTransitionError, Transition, TransitionKind
 
 KEPT_REVISIONS = 8
@@ -101,12 +102,19 @@ def revised(record: TaskRecord, event: Transition) -> TaskRecord:
 
 def proposed(record: TaskRecord, event: Transition) -> TaskRecord:
     """Keep what the decomposer proposes until it takes effect."""
-    if record.proposal is not None or event.plan is None:
+    if record.proposal is not None or event.plan is None or record.state is not TaskState.RUNNING:
         raise StaleTransitionError(f"a second proposal for task {record.id}, or none at all")
     target = _failed(record, event.subtask)
     proposal = Proposal(
-        plan=event.plan, subtask=event.subtask, note=event.note, waits=event.waits, at_ns=event.at_ns
-    )  # fmt: skip
+        plan=event.plan,
+        subtask=event.subtask,
+        note=event.note,
+        waits=event.waits,
+        hash=plan_hash(event.plan),
+        since_s=event.elapsed_s,
+        expires_s=event.expires_s,
+        at_ns=event.at_ns,
+    )
     note = "waits for an operator to agree to the new plan" if event.waits else "a new plan is there"
     return _with(replace(record, proposal=proposal), replace(target, note=note))
 

@@ -18,6 +18,7 @@ from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue
 from appliance.tasks import machine
 from appliance.tasks.api import SkillList, SkillsAsk
+from appliance.tasks.decided import Asked, placement_case, tell
 from appliance.tasks.groups.capability import Want, image_holders, why_not
 from appliance.tasks.groups.formation import Standing, Weights, form, must_form
 from appliance.tasks.line import Line, Place
@@ -41,6 +42,8 @@ class Scheduler:
         records: the tasks driven here.
         wake: told a task of which a subtask may go now.
         image_of: full reference of an image of the catalogue.
+        hindrance: why tasks may not command a robot just now; "" when they may.
+        shuns: skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it.
     """
 
     def __init__(
@@ -52,12 +55,16 @@ class Scheduler:
         records: Callable[[], Iterable[TaskRecord]],
         wake: Callable[[str], None],
         image_of: Callable[[str], str],
+        hindrance: Callable[[str], str] = lambda _: "",
+        shuns: Callable[[str, str], str] = lambda _skill, _robot: "",
     ) -> None:
         self._plane = plane
         self._catalogue = catalogue
         self._config = config
         self._records = records
         self._image_of = image_of
+        self._hindrance = hindrance
+        self._shuns = shuns
         self._looked: dict[str, float] = {}
         """Task -> when its group was last looked at as a whole."""
         self._skills: dict[str, frozenset[str]] = {}
@@ -65,6 +72,8 @@ class Scheduler:
         self._asking: dict[str, float] = {}
         """Digest of a catalogue -> when it may be asked for again."""
         self._tasks: set[asyncio.Task[None]] = set()
+        self._asked: tuple[Placement, Asked] | None = None
+        """The last placement, and what it was made from."""
         self.digest = digest_of(catalogue)
         self._skills[self.digest] = frozenset(name for name, each in catalogue.skills.items() if each.implemented)
         self.line = Line(self.gateways, backlog=config.backlog, wake=wake)
@@ -90,6 +99,8 @@ class Scheduler:
             uses={key: manifest.uses for key, manifest in manifests.items()},
             verbs={key: manifest.verbs for key, manifest in manifests.items()},
             busy=self.busy_robots(),
+            hindrance=self._hindrance,
+            shuns=lambda each, robot: self._shuns(each.subtask.skill, robot),
         )
 
     def busy_robots(self) -> frozenset[str]:
@@ -237,18 +248,36 @@ class Scheduler:
         stale_s = {name: late_s for name in gateways if (late_s := registry.stale_s(name))}
         for name in stale_s:
             registry.doubt(name)
-        return place(
-            want.need,
+        asked = Asked(
+            need=want.need,
             here=self._plane.gateway,
             gateways=gateways,
             containers=registry.containers,
             holds=holds(record, target, want.need.volumes, registry.gateways),
             robot=registry.robots.get(robot) if robot else None,
             avoid=frozenset(each.gateway for each in target.attempts if each.failure),
+            stale_s=stale_s,
+            config=self._config,
+        )
+        placement = place(
+            asked.need,
+            here=asked.here,
+            gateways=gateways,
+            containers=asked.containers,
+            holds=asked.holds,
+            robot=asked.robot,
+            avoid=asked.avoid,
             config=self._config,
             excluded=excluded,
             stale_s=stale_s,
         )
+        self._asked = (placement, asked)
+        return placement
+
+    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
+        """Tell, for the log, how the gateways stood when a subtask was sent as its placement has just said."""
+        if self._config.tell_decisions and self._asked is not None and self._asked[0] is placement:
+            tell(self._plane, placement_case(placement, self._asked[1], record, target))
 
     def likely_place(self, record: TaskRecord, target: SubtaskRecord) -> str:
         """The gateway that a subtask would be sent to now, or ""."""

@@ -4,6 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct, field
 
+from appliance.model import Approval
 from appliance.tasks.detection import DetectionConfig
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.replan.settings import ReplanConfig
@@ -46,6 +47,14 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """How often old records are looked for."""
     keep_finished: int = 500
     """Finished task records kept in this gateway's shard."""
+    tell_decisions: bool = True
+    """Put each placement with all that it rested on, so that `swiftbot log check` can make it again: 1 kB a subtask."""
+    approval: Approval = Approval.NEVER
+    """Which first plans wait for an operator's approval: `never`, `dangerous` (a skill that its manifest calls so, or
+    one that moves a robot that flies) or `always`. A request may ask for more, never for less. Never by default: robots
+    hand tasks in where nobody watches."""
+    approval_s: Annotated[float, Meta(gt=0, le=604800)] = 600.0
+    """How long a first plan waits to be approved; then the task fails: by later the site is another one."""
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     """When a run is taken for stuck or straggling."""
     replan: ReplanConfig = field(default_factory=ReplanConfig)

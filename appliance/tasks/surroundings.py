@@ -6,8 +6,19 @@ from typing import Any, Protocol
 
 from msgspec import Struct
 
-from appliance.errors import RefusedError
-from appliance.model import Group, Need, Plan, RunAccepted, RunEvent, RunRequest, SubtaskRecord, TaskRecord
+from appliance.errors import RefusedError, SwiftbotError
+from appliance.model import (
+    Group,
+    Need,
+    Plan,
+    RunAccepted,
+    RunEvent,
+    RunRequest,
+    SoftStop,
+    SubtaskRecord,
+    TaskRecord,
+    Word,
+)
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.bounds import MAX_RUN_S
@@ -16,6 +27,7 @@ from appliance.tasks.line import Place
 from appliance.tasks.placement import Placement
 from appliance.tasks.replan.robots import Robots
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.steering.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
 from appliance.tasks.transition import Transition
 
 
@@ -43,9 +55,56 @@ class Recovering(Protocol):
         """Count what was found or done, and say it in the log."""
         ...
 
+    def against(self, record: TaskRecord, target: SubtaskRecord, plan: Plan, robot: str = "") -> tuple[str, ...]:
+        """Say what a revised plan makes wrong that was not wrong before; `robot`: who takes over from `target`'s."""
+        ...
+
     async def replan(self, record: TaskRecord) -> Plan:
         """Have the decomposer plan anew what is left; PlanError when it cannot."""
         ...
+
+
+class Commands(Protocol):
+    """What is known of who may command robots; `robots.authority` provides it."""
+
+    @property
+    def active(self) -> tuple[SoftStop, ...]:
+        """Soft stops in force."""
+        ...
+
+    def holds(self, stop: SoftStop, robot: str) -> bool:
+        """Whether a soft stop is in force for a robot."""
+        ...
+
+    def ended(self, stop: str, robots: Sequence[str]) -> bool:
+        """Whether a soft stop is known to hold none of those robots any more."""
+        ...
+
+    def hindrance(self, robot: str) -> str:
+        """Why tasks may not command a robot just now; empty when they may."""
+        ...
+
+
+class _Free:
+    """Nobody stops a robot, or has taken one over."""
+
+    active: tuple[SoftStop, ...] = ()
+
+    def holds(self, stop: SoftStop, robot: str) -> bool:  # noqa: ARG002 - as Commands has it
+        """No."""
+        return False
+
+    def ended(self, stop: str, robots: Sequence[str]) -> bool:  # noqa: ARG002 - as Commands has it
+        """Not that it were known."""
+        return False
+
+    def hindrance(self, robot: str) -> str:  # noqa: ARG002 - as Commands has it
+        """Nothing."""
+        return ""
+
+
+FREE: Commands = _Free()
+"""For a task manager without robots."""
 
 
 class Surroundings(Protocol):
@@ -57,6 +116,19 @@ class Surroundings(Protocol):
     @property
     def recovery(self) -> Recovering:
         """What finding runs that go wrong and revising plans needs."""
+        ...
+
+    @property
+    def commands(self) -> Commands:
+        """Who may command robots."""
+        ...
+
+    def approval(self, record: TaskRecord, plan: Plan) -> str:
+        """Why a plan has to be approved before it takes effect; "" when it need not be."""
+        ...
+
+    def plan_problems(self, record: TaskRecord, plan: Plan) -> tuple[str, ...]:
+        """What is wrong with an edited plan in place of the one that waits, a sentence each."""
         ...
 
     async def plan(self, record: TaskRecord) -> Plan:
@@ -77,6 +149,10 @@ class Surroundings(Protocol):
 
     def regroup(self, record: TaskRecord) -> Group | None:
         """Return the group that a task should have from now on, or None when the present one may stay."""
+        ...
+
+    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
+        """Tell, for the log, how the gateways stood when a subtask was sent."""
         ...
 
     def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
@@ -123,7 +199,7 @@ class GatewayLost(Struct, frozen=True):
 class CancelAsked(Struct, frozen=True):
     """Somebody wants it to stop."""
 
-    by: str = ""
+    word: Word | None = None
 
 
 class Wake(Struct, frozen=True):
@@ -163,14 +239,32 @@ class PlanMade(Struct, frozen=True, kw_only=True):
     why: str
 
 
-class Agreement(Struct, frozen=True, kw_only=True):
-    """An operator's word on a proposed plan."""
+class Steered(Struct, frozen=True, kw_only=True):
+    """An operator's order. `outcome` becomes the record when it is written with what followed, or says why not."""
 
-    agree: bool
-    by: str = ""
+    ask: ApproveAsk | RejectAsk | PauseAsk | ResumeAsk | RetryAsk
+    outcome: "asyncio.Future[TaskRecord]"
+
+    def refuse(self, error: SwiftbotError) -> None:
+        """Say why it was not taken."""
+        if not self.outcome.done():
+            self.outcome.set_exception(error)
+
+    def done(self, record: TaskRecord) -> None:
+        """Say that it is written."""
+        if not self.outcome.done():
+            self.outcome.set_result(record)
 
 
-Input = RunNews | GatewayLost | CancelAsked | MoveReady | PlanMade | Agreement | Wake
+class RunHeld(Struct, frozen=True, kw_only=True):
+    """A run has saved a checkpoint and sends no command: it can be ended for a pause (`note`: why)."""
+
+    subtask: str
+    attempt: int
+    note: str
+
+
+Input = RunNews | GatewayLost | CancelAsked | MoveReady | PlanMade | Steered | RunHeld | Wake
 
 
 def figures(plane: Plane, gateway: str) -> dict[str, Any]:

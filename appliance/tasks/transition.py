@@ -6,7 +6,19 @@ from typing import Any
 from msgspec import Struct
 
 from appliance.errors import SwiftbotError
-from appliance.model import PLAIN_PRIORITY, Choice, Failure, Group, Phase, Plan, Split
+from appliance.model import (
+    PLAIN_PRIORITY,
+    Approval,
+    Choice,
+    Decision,
+    Failure,
+    Group,
+    Pause,
+    Phase,
+    Plan,
+    Split,
+    Word,
+)
 
 
 class TransitionKind(StrEnum):
@@ -40,9 +52,22 @@ class TransitionKind(StrEnum):
     SUBSTITUTED = "substituted"
     """An alternative skill takes the place of one that was given up; `plan` is the plan from now on."""
     PROPOSED = "proposed"
-    """The decomposer has planned anew (`plan`, as it gave it); with `waits` an operator has to agree first."""
+    """A plan is there and may have to be approved (`waits`): the first one (no `subtask`), or a new one of the
+    decomposer after a failure, as it gave it."""
     AGREED = "agreed"
-    """An operator agrees to what was proposed."""
+    """An operator agrees to what was proposed (in logs of earlier versions)."""
+    APPROVED = "approved"
+    """An operator approves what was proposed (`decision`), or another plan in its place (`plan`)."""
+    REJECTED = "rejected"
+    """An operator turns it down (`decision`)."""
+    PAUSED = "paused"
+    """No subtask is started from now on (`pause`)."""
+    RESUMED = "resumed"
+    """A pause has ended: an operator's, or that of the soft stop `pause.stop`."""
+    HELD = "held"
+    """A run is ended, and its subtask waits for another attempt although nothing was wrong with it (`note`: why)."""
+    RETRIED = "retried"
+    """An operator has what has failed tried again: a task that has ended, or one `subtask` (`word`)."""
     REPLANNED = "replanned"
     """What was proposed takes effect; `plan` is the plan from now on, with all that is finished."""
     REPLAN_FAILED = "replan failed"
@@ -96,6 +121,16 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Of an attempt that is given up: the task goes on, and its plan is to be revised."""
     condition: str = ""
     waits: bool = False
+    retries: int | None = None
+    """Of a failed attempt: how many more its skill allows, where that is what decided about `give_up`."""
+    approval: Approval = Approval.NEVER
+    """On `accepted`: what its submitter wanted."""
+    expires_s: float = 0.0
+    """On `proposed`: how long it waits to be approved."""
+    decision: Decision | None = None
+    pause: Pause | None = None
+    word: Word | None = None
+    """On `cancel` and `retried`: who, and why."""
     cpu_ms: float | None = None
     peak_mb: float | None = None
 

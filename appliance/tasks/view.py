@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from appliance.model import Failure, Group, Proposal, Revision, SubtaskRecord, TaskRecord
+from appliance.model import Decision, Failure, Group, Proposal, Revision, SubtaskRecord, TaskRecord, Word
 
 
 class SubtaskView(Struct, frozen=True, kw_only=True):
@@ -68,7 +68,13 @@ class TaskView(Struct, frozen=True, kw_only=True):
     revisions: tuple[Revision, ...]
     """What was changed about its plan after failures, oldest first."""
     proposal: Proposal | None
-    """A new plan that has not taken effect yet."""
+    """A plan that has not taken effect yet: the first one, or a new one after a failure."""
+    decision: Decision | None
+    """The last word of an operator on a plan of it."""
+    paused: str | None
+    """Why no subtask is started."""
+    cancelled_by: Word | None
+    retried_by: Word | None
     subtasks: tuple[SubtaskView, ...]
     notes: tuple[str, ...]
     """What people should know of its course: what a partition doubled, and what was done about it."""
@@ -96,6 +102,10 @@ def view(record: TaskRecord) -> TaskView:
         error=record.failure,
         revisions=record.revisions,
         proposal=record.proposal,
+        decision=record.decision,
+        paused=record.paused or None,
+        cancelled_by=record.cancelled_by,
+        retried_by=record.retried_by,
         subtasks=tuple(_subtask(each) for each in record.subtasks),
         notes=tuple(each.note for each in record.splits if each.note),
     )

@@ -9,7 +9,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import NotFoundError
-from appliance.model import PLAIN_PRIORITY, Attempt, Choice, Failure, Group, SubtaskRecord, TaskRecord
+from appliance.model import PLAIN_PRIORITY, Attempt, Choice, Failure, Group, SubtaskRecord, TaskRecord, TaskState
 
 
 class AttemptWhy(Struct, frozen=True, kw_only=True):
@@ -77,6 +77,8 @@ class TaskWhy(Struct, frozen=True, kw_only=True):
     """What it had to expect when it was accepted and planned."""
     group: Group | None = None
     """The gateways that serve it, its root, and how that came about."""
+    waits: str = ""
+    """What the task as a whole waits for: an operator's approval, the end of a pause."""
 
 
 def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
@@ -97,7 +99,15 @@ def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
         deadline_s=record.deadline_s,
         note=record.note,
         group=record.group,
+        waits=waits_for(record),
     )
+
+
+def waits_for(record: TaskRecord) -> str:
+    """What a task as a whole waits for, in words; empty when it is nothing."""
+    if record.state is TaskState.PROPOSED and record.proposal is not None:
+        return f"an operator to approve its plan {record.proposal.hash[:12]}: {record.proposal.note}"
+    return record.paused
 
 
 def with_waits(found: TaskWhy, waits: Mapping[str, Waits], *, left_s: float | None) -> TaskWhy:

@@ -48,7 +48,7 @@ class Lookup:
         """Named as owners: name -> distance from the position on to it."""
         self._steps: dict[str, Step] = {}
         here = view.step(target)
-        for name in view.names:
+        for name in view.nearest(target, MOST_ASKED):
             self._before[name] = (target - point(name)) % RING_SIZE
         self._take(view.me, here)
 

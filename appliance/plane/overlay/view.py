@@ -9,7 +9,7 @@ is one hop. Each member has one point on the ring here: further virtual nodes wo
 
 import math
 import random
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 
 from msgspec import Struct
@@ -29,7 +29,7 @@ def successor_count(members: float, bound: int) -> int:
     """Length of the successor list: 2·log2 N, at least 5, at most half the view.
 
     With half of all members failing at once, no successor is left of a fraction 2**-(2·log2 N) = N**-2 of members
-    (ToN 2003, theorem IV.5, asks for a multiple of log N; its simulation of 1,000 nodes uses 20).
+    (SIGCOMM 2001, theorem 7, asks for a multiple of log N).
     """
     return max(1, min(bound // 2, max(5, math.ceil(2 * math.log2(max(2.0, members))))))
 
@@ -69,6 +69,7 @@ class View:
         self._successors = successors
         self._distances: list[int] = []
         self._names: list[str] = []
+        self._known: set[str] = set()
         # All members at distances in (0, _reach] and in [_back, RING_SIZE) are known.
         self._reach = 0
         self._back = RING_SIZE
@@ -104,7 +105,7 @@ class View:
         return len(self._names)
 
     def __contains__(self, name: str) -> bool:
-        return self._find(name) is not None
+        return name in self._known
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -165,6 +166,16 @@ class View:
             return Step(owners=tuple(names[here : min(here + most, self._within())]), closer=self._closer(here))
         return Step(owners=tuple(self.before()) if named else (), closer=self._closer(here))
 
+    def nearest(self, target: int, most: int) -> list[str]:
+        """The members known that come before a position or are at it, the nearest first, at most so many."""
+        here = bisect_right(self._distances, (target - self.origin) % RING_SIZE)
+        found = self._names[max(0, here - most) : here]
+        rest = most - len(found)
+        if rest > 0:
+            found = self._names[max(here, len(self._names) - rest) :] + found
+        found.reverse()
+        return found
+
     def around(self, others: tuple[str, ...] = ()) -> Around:
         """What `me` tells a member that it meets."""
         if self.whole and len(self._names) <= self.bound // 2:
@@ -204,6 +215,7 @@ class View:
             return False
         del self._distances[index]
         del self._names[index]
+        self._known.discard(name)
         return True
 
     def merge(self, other: str, told: Around) -> list[str]:
@@ -252,6 +264,7 @@ class View:
         order = sorted(kept)
         self._distances = [self._distances[index] for index in order]
         self._names = [self._names[index] for index in order]
+        self._known = set(self._names)
 
     def targets(self) -> list[int]:
         """The positions whose owners are worth knowing: at distances that grow by a constant factor.
@@ -295,10 +308,13 @@ class View:
         return index if index < len(self._names) and self._names[index] == name else None
 
     def _insert(self, name: str) -> bool:
+        if name in self._known:  # most of what is heard
+            return False
         distance = (point(name) - self.origin) % RING_SIZE
         index = bisect_left(self._distances, distance)
         if distance == 0 or (index < len(self._names) and self._distances[index] == distance):
             return False
         self._distances.insert(index, distance)
         self._names.insert(index, name)
+        self._known.add(name)
         return True

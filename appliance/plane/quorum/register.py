@@ -84,6 +84,46 @@ def agreed(votes: Iterable[Vote], voters: int) -> Ballot | None:
     return next((ballot for ballot, count in counts.items() if count >= majority(voters)), None)
 
 
+def unknown(floor: Ballot) -> Vote:
+    """A voter's vote on a register of which it remembers nothing; `floor`: the highest promise that it has forgotten.
+
+    To promise more than one must is always safe. Whatever was sent while it still remembered is refused then.
+    """
+    return Vote(promised=floor)
+
+
+def forgettable(vote: Vote, plain: Record | None, told: Iterable[tuple[Vote, Record | None]], voters: int) -> bool:
+    """Whether a voter may forget a register that was removed.
+
+    It may once no voter can ever tell of a value from before the removal: all have accepted the removal or something
+    later, or have forgotten it already, and accept nothing older. What a voter tells of this stays true, so answers
+    need not be of one moment. Ordinary copies count too where a register is forgotten, so none may hold a value.
+
+    Args:
+        vote: its own; its ballot is that of the removal.
+        plain: its own ordinary record.
+        told: the votes and ordinary records of all the other voters.
+        voters: how many there are.
+    """
+    told = list(told)
+    return (
+        vote.record is not None
+        and len(told) == voters - 1
+        and all(_gone(each) for each in (vote.record, plain))
+        and all(
+            other.promised > vote.accepted
+            and (other.accepted == NONE or other.accepted >= vote.accepted)
+            and _gone(other.record)
+            and _gone(copy)
+            for other, copy in told
+        )
+    )
+
+
+def _gone(record: Record | None) -> bool:
+    return record is None or record.deleted
+
+
 def check_ballot(ballot: Ballot) -> Ballot:
     """Return a ballot from elsewhere if it may be one; PayloadError otherwise."""
     if not 0 < ballot.round < _MOST_ROUND or not 1 <= len(ballot.proposer) <= 80 or not ballot.proposer.isprintable():

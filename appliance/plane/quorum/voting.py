@@ -6,24 +6,19 @@ a majority has accepted the same; only where they differ the first voter settles
 """
 
 import asyncio
-import hashlib
 import random
 import secrets
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
-from functools import partial
 from typing import TypeVar
 from weakref import WeakValueDictionary
 
-import msgspec
 import structlog
 from msgspec import Struct
 
 from appliance.errors import (
-    ConfigError,
     ConflictError,
     DeadlineError,
-    PayloadError,
     RefusedError,
     SwiftbotError,
     UnreachableError,
@@ -32,8 +27,8 @@ from appliance.model import VersionVector
 from appliance.plane.membership import Membership
 from appliance.plane.quorum import register
 from appliance.plane.quorum.messages import AcceptAsk, Outcome, PrepareAsk, SettleAsk, VoteAsk, Voted
-from appliance.plane.quorum.register import NONE, Ballot, Vote, check_ballot, check_vote, majority
-from appliance.plane.ring import Ring
+from appliance.plane.quorum.register import NONE, Ballot, check_vote, majority
+from appliance.plane.quorum.voter import Voter
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
@@ -63,11 +58,6 @@ _BACK_OFF_S = (0.003, 0.03)
 """After another proposer was faster: drawn, so that two do not keep step."""
 _MOST_LEADS = 4096
 """Registers whose next change needs no promise."""
-_MOST_JUMP = 2**32
-"""A ballot further ahead than that is no proposer's: it would use up the numbers."""
-_VOTE = "quorum/"
-"""Votes are kept in the store under this and the key."""
-_NO_VOTE = "quorum-lost"
 
 
 class _OutrunError(Exception):
@@ -87,20 +77,13 @@ class Voting:
         """Told each value that was chosen here, for the ordinary records."""
         self._config = config
         self._gateway = gateway
-        self._store = store
         self._rpc = rpc
         self._membership = membership
-        self._ring = Ring(config.voters, virtual_nodes=config.virtual_nodes)
-        named = f"{sorted(config.voters)} {config.replicas} {config.virtual_nodes}"
-        self._digest = hashlib.blake2b(named.encode(), digest_size=8).hexdigest()
+        self.voter = Voter(config, gateway=gateway, store=store, rpc=rpc)
         self._proposer = f"{gateway}:{secrets.token_hex(6)}"
         self._round = 0
         self._leads: OrderedDict[str, tuple[Ballot, Record | None]] = OrderedDict()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._lost = True
-        rpc.register("quorum_prepare", PrepareAsk, self._on_prepare, exchange=False)
-        rpc.register("quorum_accept", AcceptAsk, self._on_accept, exchange=False)
-        rpc.register("quorum_vote", VoteAsk, self._on_vote, exchange=False)
         rpc.register("quorum_write", Write, self._on_write, exchange=False)
         rpc.register("quorum_settle", SettleAsk, self._on_settle, exchange=False)
 
@@ -108,12 +91,7 @@ class Voting:
 
     def voters(self, key: str) -> tuple[str, ...]:
         """The gateways that vote on a key, there or not; ConfigError when none are configured."""
-        if not self._config.voters:
-            raise ConfigError(
-                "a quorum was asked for, and plane.voters names nobody",
-                remedy="name the gateways that vote in plane.voters, the same at every gateway",
-            )
-        return self._ring.successors(key, self._config.replicas)
+        return self.voter.voters(key)
 
     async def read(self, key: str) -> Record | None:
         """Return the register's value (a tombstone too) as it was at some moment during the call.
@@ -123,12 +101,12 @@ class Voting:
             UnreachableError: fewer than a majority of the key's voters answer.
         """
         voters = self.voters(check_key(key))
-        ask = VoteAsk(key=key, voters=self._digest)
+        ask = VoteAsk(key=key, voters=self.voter.digest)
 
         def same(answers: list[Voted]) -> bool:
             return register.agreed((each.vote for each in answers), len(voters)) is not None
 
-        answers = await self._poll(voters, "quorum_vote", ask, self._on_vote, same)
+        answers = await self._poll(voters, "quorum_vote", ask, self.voter.on_vote, same)
         ballot = register.agreed((each.vote for each in answers), len(voters))
         if ballot is not None:
             agreeing = [each for each in answers if each.vote.accepted == ballot]
@@ -149,16 +127,25 @@ class Voting:
         check_write(asked, max_bytes=self._config.max_record_bytes)
         return (await self._handed("quorum_write", asked, self._on_write, asked.key)).version
 
-    async def start(self, *, lost: bool) -> None:
-        """Begin to vote. `lost`: the store's file could not be read, and with it went what was promised."""
-        if lost:
-            await self._store.put(_NO_VOTE, b"1")
-        self._lost = await self._store.get(_NO_VOTE) is not None
-        if self._lost and self._gateway in self._config.voters:
-            log.error(
-                "this gateway does not vote: its promises were lost with its file",
-                remedy="give it a new id and name that in plane.voters in place of the old one",
-            )
+    async def told(self, key: str) -> list[Voted]:
+        """What the other voters of a key have promised and accepted; those that do not answer are left out."""
+        others = tuple(each for each in self.voters(key) if each != self._gateway)
+        ask = VoteAsk(key=key, voters=self.voter.digest)
+        return await self._poll(others, "quorum_vote", ask, self.voter.on_vote, lambda _: False)
+
+    def let_go(self, key: str) -> None:
+        """Prepare anew before the next change of a register."""
+        self._leads.pop(key, None)
+
+    async def everywhere(self, key: str) -> None:
+        """Have all voters accept the register's value that can be reached, not just a majority."""
+        await self._propose(key, None)
+        voters = self.voters(key)
+        async with self._locks.setdefault(key, asyncio.Lock()):
+            ballot, record = self._leads.pop(key, (NONE, None))
+            if record is not None:
+                ask = AcceptAsk(key=key, ballot=ballot, record=record, voters=self.voter.digest)
+                await self._poll(voters, "quorum_accept", ask, self.voter.on_accept, lambda _: False)
 
     # --- handing on -------------------------------------------------------------------------------------------
 
@@ -276,16 +263,16 @@ class Voting:
         """Have a majority promise a ballot; returns it, and the register's value."""
         self._round += 1
         ballot = Ballot(self._round, self._proposer)
-        ask = PrepareAsk(key=key, ballot=ballot, voters=self._digest)
-        answers = await self._majority(voters, "quorum_prepare", ask, self._on_prepare)
+        ask = PrepareAsk(key=key, ballot=ballot, voters=self.voter.digest)
+        answers = await self._majority(voters, "quorum_prepare", ask, self.voter.on_prepare)
         votes = [each.vote for each in answers]
         plain = [each.plain for each in answers if each.plain is not None]
         return ballot, register.current(votes, plain, self.resolver())
 
     async def _accept(self, key: str, voters: tuple[str, ...], ballot: Ballot, record: Record) -> None:
         self._round = max(self._round, ballot.round + 1)
-        ask = AcceptAsk(key=key, ballot=ballot, record=record, voters=self._digest)
-        await self._majority(voters, "quorum_accept", ask, self._on_accept)
+        ask = AcceptAsk(key=key, ballot=ballot, record=record, voters=self.voter.digest)
+        await self._majority(voters, "quorum_accept", ask, self.voter.on_accept)
         self._leads[key] = (ballot.next(), record)
         if len(self._leads) > _MOST_LEADS:
             self._leads.popitem(last=False)
@@ -311,57 +298,6 @@ class Voting:
             raise _OutrunError
         raise _NoMajorityError(f"{len(granted)} of {len(voters)} voters answer, {needed} are needed")
 
-    # --- voting -----------------------------------------------------------------------------------------------
-
-    async def _on_prepare(self, asked: PrepareAsk) -> Voted:
-        self._check(asked.key, asked.voters)
-        check_ballot(asked.ballot)
-        return await self._vote(asked.key, partial(_promised, asked.ballot))
-
-    async def _on_accept(self, asked: AcceptAsk) -> Voted:
-        self._check(asked.key, asked.voters)
-        check_ballot(asked.ballot)
-        check_record(asked.record, max_bytes=self._config.max_record_bytes)
-        if asked.record.key != asked.key:
-            raise PayloadError(f"a record of {asked.record.key} for {asked.key}")
-        voted = await self._vote(asked.key, partial(_accepted, asked.ballot, asked.record))
-        # The proposer knows the record.
-        return Voted(granted=voted.granted, vote=Vote(promised=voted.vote.promised))
-
-    async def _on_vote(self, asked: VoteAsk) -> Voted:
-        self._check(asked.key, asked.voters)
-        raw = await self._store.get(_VOTE + asked.key)
-        vote = Vote() if raw is None else msgspec.msgpack.decode(raw, type=Vote)
-        return Voted(vote=vote, plain=await self._store.record(asked.key))
-
-    async def _vote(self, key: str, change: Callable[[Vote], Vote | None]) -> Voted:
-        """Change a vote and have it on the disk; not granted when `change` says None."""
-
-        def alter(raw: bytes | None) -> bytes | None:
-            nonlocal vote, granted
-            vote, granted = Vote() if raw is None else msgspec.msgpack.decode(raw, type=Vote), False
-            changed = change(vote)
-            if changed is None:
-                return None
-            vote, granted = changed, True
-            return msgspec.msgpack.encode(changed)
-
-        vote, granted = Vote(), False
-        await self._store.alter(_VOTE + key, alter)
-        return Voted(granted=granted, vote=vote, plain=await self._store.record(key))
-
-    def _check(self, key: str, digest: str) -> None:
-        check_key(key)
-        if digest != self._digest:
-            raise RefusedError(
-                f"{self._gateway} is told other voters than whoever asks",
-                remedy="plane.voters, replicas and virtual_nodes must be the same at every gateway",
-            )
-        if self._gateway not in self.voters(key):
-            raise RefusedError(f"{self._gateway} does not vote on {key}")
-        if self._lost:
-            raise RefusedError(f"{self._gateway} has lost its promises and does not vote", remedy="give it a new id")
-
 
 def _decided(found: Record | None, asked: Write, gateway: str) -> Record:
     try:
@@ -371,18 +307,6 @@ def _decided(found: Record | None, asked: Write, gateway: str) -> Record:
             f"{asked.key}: no majority knows the version expected",
             remedy="read it with a quorum, and decide again",
         ) from None
-
-
-def _promised(ballot: Ballot, vote: Vote) -> Vote | None:
-    if ballot.round > vote.promised.round + _MOST_JUMP:
-        raise PayloadError(f"a ballot of round {ballot.round:,} after {vote.promised.round:,}")
-    return register.promise(vote, ballot)
-
-
-def _accepted(ballot: Ballot, record: Record, vote: Vote) -> Vote | None:
-    if ballot.round > vote.promised.round + _MOST_JUMP:
-        raise PayloadError(f"a ballot of round {ballot.round:,} after {vote.promised.round:,}")
-    return register.accept(vote, ballot, record)
 
 
 def _checked(answer: Voted, most: int) -> Voted:

@@ -8,14 +8,15 @@ run_leave                RunAsk -> RunStatus           it was moved: end it; ans
 run_reserve              RunRequest -> Reserved        have a container ready for a run that will be moved here
 run_unreserve            RunAsk -> RunStatus           it will not come
 drain                    DrainAsk -> DrainState        give all runs away and take no more; answers at once
-undrain, drain_state     DrainStateAsk -> DrainState   take runs again; how far it is
+undrain                  UndrainAsk -> DrainState      take runs again
+drain_state              DrainStateAsk -> DrainState   how far it is
 """
 
 from enum import StrEnum
 
 from msgspec import Struct
 
-from appliance.model import Need, Phase
+from appliance.model import Need, Phase, Signed
 from appliance.tasks.api import RunAsk
 
 
@@ -44,7 +45,7 @@ class MigrationRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     at_ns: int = 0
 
 
-class MigrateAsk(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+class MigrateAsk(Signed, frozen=True, kw_only=True):
     """`migrate`: move a subtask's run, to `to` or wherever is best."""
 
     task: str
@@ -127,14 +128,18 @@ class Reserved(Struct, frozen=True, kw_only=True):
     lease_s: float
 
 
-class DrainAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DrainAsk(Signed, frozen=True, kw_only=True):
     """`drain`: give all runs away. After `deadline_s` those left are cancelled and repeated elsewhere; 0: never."""
 
     deadline_s: float = 0.0
 
 
 class DrainStateAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`drain_state`, `undrain`."""
+    """`drain_state`."""
+
+
+class UndrainAsk(Signed, frozen=True, kw_only=True):
+    """`undrain`."""
 
 
 class Remaining(Struct, frozen=True, kw_only=True):

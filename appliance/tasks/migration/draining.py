@@ -15,7 +15,7 @@ import structlog
 from appliance.errors import PayloadError, SwiftbotError
 from appliance.tasks.api import RunAsk
 from appliance.tasks.executor import Executor, Here
-from appliance.tasks.migration.api import DrainAsk, DrainState, DrainStateAsk, Reason, Remaining
+from appliance.tasks.migration.api import DrainAsk, DrainState, DrainStateAsk, Reason, Remaining, UndrainAsk
 from appliance.tasks.migration.leaving import Leaving
 from appliance.tasks.migration.requesting import Requesting
 from appliance.tasks.migration.settings import MigrationConfig
@@ -116,7 +116,7 @@ class Draining:
         self.begin(ask.deadline_s)
         return self.state()
 
-    async def undrain(self, ask: DrainStateAsk) -> DrainState:
+    async def undrain(self, ask: UndrainAsk) -> DrainState:
         """Take runs again; those being moved just now go all the same."""
         del ask
         if not self._stopping:

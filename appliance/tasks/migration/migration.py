@@ -10,7 +10,7 @@ from appliance.plane.node import Plane
 from appliance.pool.pool import Pool
 from appliance.tasks.api import RunAsk
 from appliance.tasks.executor import Executor
-from appliance.tasks.migration.api import DrainAsk, DrainStateAsk, HoldAsk, MigrateAsk, MoveAsk
+from appliance.tasks.migration.api import DrainAsk, DrainStateAsk, HoldAsk, MigrateAsk, MoveAsk, Reason, UndrainAsk
 from appliance.tasks.migration.draining import Draining
 from appliance.tasks.migration.leaving import Leaving
 from appliance.tasks.migration.moving import Moving, Tasks
@@ -19,6 +19,7 @@ from appliance.tasks.migration.requesting import Requesting
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.migration.shedding import Shedding
 from appliance.tasks.migration.taking import Taking
+from appliance.tasks.steering.audit import Audit
 
 
 class Migration:
@@ -34,6 +35,7 @@ class Migration:
         load: what the gateway sees of itself.
         volumes_mb: size of the state volumes of these names here, MB.
         on_change: called when there is something to show in the status.
+        audit: of operators' orders.
     """
 
     def __init__(
@@ -48,9 +50,11 @@ class Migration:
         load: Callable[[], Load],
         volumes_mb: Callable[[Iterable[str]], float],
         on_change: Callable[[], None],
+        audit: Audit,
     ) -> None:
         self._plane = plane
         self._leaving = leaving
+        self._audit = audit
         self._moving = Moving(plane, tasks, config)
         requesting = Requesting(plane, self._moving)
         self.shedding = Shedding(
@@ -70,7 +74,8 @@ class Migration:
     def start(self) -> None:
         """Answer the verbs, and begin to look at the load."""
         rpc = self._plane.rpc
-        rpc.register("migrate", MigrateAsk, self._moving.migrate)
+        signed = self._audit.signed
+        rpc.register("migrate", MigrateAsk, signed("migrate", self._moving.migrate, when=_by_operator))
         rpc.register("migrate_here", MigrateAsk, self._moving.migrate_here)
         rpc.register("migrate_cancel", MoveAsk, self._moving.cancel)
         rpc.register("run_hold", HoldAsk, self._leaving.hold)
@@ -78,8 +83,8 @@ class Migration:
         rpc.register("run_leave", RunAsk, self._leaving.leave)
         rpc.register("run_reserve", RunRequest, self._taking.reserve)
         rpc.register("run_unreserve", RunAsk, self._taking.unreserve)
-        rpc.register("drain", DrainAsk, self.draining.drain)
-        rpc.register("undrain", DrainStateAsk, self.draining.undrain)
+        rpc.register("drain", DrainAsk, signed("drain", self.draining.drain))
+        rpc.register("undrain", UndrainAsk, signed("undrain", self.draining.undrain))
         rpc.register("drain_state", DrainStateAsk, self.draining.ask_state)
         self._looking = asyncio.create_task(self.shedding.run(), name="looks at the load")
 
@@ -92,3 +97,8 @@ class Migration:
         await self.draining.close()
         await self.shedding.close()
         await self._moving.close()
+
+
+def _by_operator(ask: MigrateAsk) -> bool:
+    """Gateways ask for moves too, when they drain or have too much to do."""
+    return ask.reason is Reason.OPERATOR

@@ -16,10 +16,11 @@ ones never swap); a run rests after a move; and moves are rationed, for each gat
 overloaded, for the fleet.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 from msgspec import Struct
 
+from appliance.model import RunRequest
 from appliance.tasks.migration.budget import Bucket
 from appliance.tasks.migration.settings import MigrationConfig
 
@@ -189,6 +190,21 @@ class Overload:
             return True
         left_s = remaining_s(run)
         return left_s >= config.nearly_done_s and cost_s(run) < left_s
+
+
+def may_leave(request: RunRequest, mobility: str, *, began: bool, others: Set[str]) -> bool:
+    """Whether a run may be moved to any of the other gateways at all.
+
+    Args:
+        request: the order; one that no coordinator has sent is nobody's record and stays, and so does one whose
+            submitter allows no gateway but this one: while it waits, what works before it has to go.
+        mobility: of its skill, by the manifest.
+        began: whether its handler has begun.
+        others: the gateways that are there, without this one.
+    """
+    if not request.coordinator or (request.group and others.isdisjoint(request.group)):
+        return False
+    return mobility != "never" or not began
 
 
 def remaining_s(run: Candidate) -> float:

@@ -14,7 +14,7 @@ from appliance.tasks.executor import Executor, Here
 from appliance.tasks.migration.api import Reason
 from appliance.tasks.migration.closest import busy
 from appliance.tasks.migration.leaving import Leaving
-from appliance.tasks.migration.overload import Candidate, Load, Overload, Room
+from appliance.tasks.migration.overload import Candidate, Load, Overload, Room, may_leave
 from appliance.tasks.migration.requesting import Requesting
 from appliance.tasks.migration.settings import MigrationConfig
 
@@ -113,8 +113,7 @@ class Shedding:
         ask = RunAsk(task=request.task, subtask=request.subtask, attempt=request.attempt)
         return Candidate(
             id=run,
-            # One that no coordinator has sent is nobody's record: it cannot be moved.
-            mobile=bool(request.coordinator) and (mobility != "never" or not here.began),
+            mobile=may_leave(request, mobility, began=here.began, others=self._plane.members() - {self._plane.gateway}),
             began=here.began,
             cpu=request.need.cpu,
             elapsed_s=now - here.since,

@@ -9,7 +9,8 @@ from msgspec import Struct
 
 from appliance.model import SubtaskRecord, TaskRecord
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.replan.robots import Rebinding, Robots, another_robot, is_the_robots, robot_of
+from appliance.tasks.replan.allowed import Against, allowed_robot
+from appliance.tasks.replan.robots import Rebinding, Robots, is_the_robots, robot_of
 from appliance.tasks.replan.settings import ReplanConfig
 from appliance.tasks.replan.skills import Substitution, alternative_skill
 
@@ -35,10 +36,12 @@ def worth_replanning(failure_code: str) -> bool:
 
 
 def confirmed(record: TaskRecord) -> bool:
-    """Whether a plan that came with its task is the decomposer's, which somebody looked at and confirmed.
+    """Whether somebody approved a plan of this task, or it came with the decomposer's, which somebody had looked at.
 
     One that was written by hand says nothing of how sure a planner is of it.
     """
+    if record.decision is not None and record.decision.approved:
+        return True
     return record.handed_in and record.plan is not None and record.plan.confidence > 0
 
 
@@ -49,6 +52,7 @@ def decide(
     manifests: Mapping[str, SkillManifest],
     robots: Robots,
     config: ReplanConfig,
+    against: Against = lambda _plan, _robot: (),
 ) -> Decision:
     """Decide what is done about a subtask that was given up.
 
@@ -58,6 +62,7 @@ def decide(
         manifests: those that are known here, by skill.
         robots: the roster.
         config: what the operator allows.
+        against: what is against a revised plan, by the checks that every plan has to pass.
     """
     if record.revised >= config.max_revisions:
         return GiveUp(note=f"the plan was revised {record.revised} times already (tasks.replan.max_revisions)")
@@ -66,7 +71,9 @@ def decide(
         robot = robot_of(target)
         why = is_the_robots(target.failure, robots.roster.get(robot)) if target.failure and robot else ""
         if why:
-            rebinding = another_robot(record, target, why, manifests=manifests, robots=robots, config=config)
+            rebinding = allowed_robot(
+                record, target, why, manifests=manifests, robots=robots, config=config, against=against
+            )
             if isinstance(rebinding, Rebinding):
                 return rebinding
             reasons.append(rebinding)
@@ -74,7 +81,10 @@ def decide(
         alternative_skill(record, target, manifests=manifests) if config.skills else "tasks.replan.skills is off"
     )
     if isinstance(substitution, Substitution):
-        return substitution
+        wrong = against(substitution.plan, "")
+        if not wrong:
+            return substitution
+        substitution = f"{substitution.subtask.skill} may not take its place: {'; '.join(wrong[:3])}"
     reasons.append(substitution)
     if record.handed_in and not confirmed(record):
         reasons.append("its plan was handed in with the task and is not planned anew")

@@ -6,7 +6,7 @@ position), copies of those subtasks go before the rest, for the new robot. Where
 """
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import cast
 
 from msgspec import Struct
@@ -21,7 +21,7 @@ from appliance.tasks.replan.ties import left
 from appliance.tasks.revising import ACTIVE, MAX_SUBTASKS
 
 _ANY = re.compile(r"any\d{0,2}")
-_ITS_FAULT = ("robot", "busy")
+_ITS_FAULT = ("robot", "busy", "taken")
 """Codes of failures that are a robot's own."""
 _ITS_WORD = ("refused", "unreachable", "deadline")
 """Codes that are a robot's when it is offline, or when a handler passed its final refusal on."""
@@ -40,6 +40,8 @@ class Robots(Struct, frozen=True, kw_only=True):
 
     roster: Mapping[str, RobotInfo]
     busy: Collection[str] = ()
+    shuns: Callable[[str, str], str] = lambda _skill, _robot: ""
+    """Skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it."""
 
 
 def robot_of(target: SubtaskRecord) -> str:
@@ -67,6 +69,7 @@ def another_robot(
     manifests: Mapping[str, SkillManifest],
     robots: Robots,
     config: ReplanConfig,
+    barred: Collection[str] = (),
 ) -> Rebinding | str:
     """Choose another robot for what a subtask's robot has left to do.
 
@@ -77,6 +80,7 @@ def another_robot(
         manifests: by skill.
         robots: the roster.
         config: what the operator allows.
+        barred: robots that are not to be chosen.
 
     Returns:
         The rebinding, or why there is none.
@@ -96,7 +100,7 @@ def another_robot(
         return f"what {unknown[0]} needs of a robot is not known here"
     wanted = [manifests[each.subtask.skill] for each in (*rest, *again)]
     tried = {each.robot for one in rest for each in one.attempts if each.robot and each.failure}
-    chosen, reason = _choose(record, label, {old, *tried}, wanted, robots, config)
+    chosen, reason = _choose(record, label, {old, *tried, *barred}, wanted, robots, config)
     if chosen is None:
         return f"no other robot can take over: {reason}"
     plan = _with_copies(record, {each.subtask.id for each in roots}, [each.subtask for each in again])
@@ -174,7 +178,8 @@ def _choose(
         else:
             fitting.append(robot)
     others = {robot_of(each) for each in record.subtasks if each.subtask.robot not in (None, label)}
-    fitting.sort(key=lambda robot: (robot.id in others, robot.id in robots.busy, robot.id))
+    shunned = {robot.id: any(robots.shuns(each.id, robot.id) for each in wanted) for robot in fitting}
+    fitting.sort(key=lambda robot: (robot.id in others, shunned[robot.id], robot.id in robots.busy, robot.id))
     if not fitting:
         return None, "; ".join(sorted(reasons)[:4]) or "there is no other"
     return fitting[0], ""

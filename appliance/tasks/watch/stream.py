@@ -13,6 +13,7 @@ from typing import Protocol
 from appliance.errors import SwiftbotError
 from appliance.model import LogLine, Notice, RunEvent, TaskRecord
 from appliance.plane.keys import Keys
+from appliance.plane.once import Once
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
 from appliance.tasks.api import TaskLines, TaskLinesAsk
@@ -108,8 +109,10 @@ class Stream:
             if told is not None and told.task == self._task:
                 self._put(told)
 
+        once = Once()
+
         def on_notice(_: str, notice: Notice | None) -> None:
-            if notice is not None and notice.task == self._task:
+            if notice is not None and notice.task == self._task and once.new(notice.id):
                 self._put(lines.of_notice(notice))
 
         def on_event(_: str, event: RunEvent | None) -> None:

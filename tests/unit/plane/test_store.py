@@ -6,7 +6,9 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Awaitable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -233,6 +235,61 @@ async def test_a_decision_is_known_before_it_is_committed(tmp_path: Path) -> Non
     await store.close()
     with pytest.raises(RefusedError):
         store.change_soon("k", lambda _: _record("k"))
+
+
+async def test_what_a_conflict_is_with_can_be_read(tmp_path: Path) -> None:
+    """A decision that fails for a record on its way to the disk is told so when that record can be read."""
+    store = await Store.open(tmp_path / "s.sqlite")
+
+    def only_new(now: Record | None) -> Record:
+        if now is not None:
+            raise ConflictError("exists already")
+        return _record("k")
+
+    _, first = store.change_soon("k", only_new)
+    again, _ = store.change_soon("k", only_new)
+    with pytest.raises(ConflictError):
+        await again
+    assert store.look("k") == (True, _record("k"))
+    assert await first == _record("k")
+    await store.close()
+
+
+async def test_decisions_on_all_ways_follow_one_another(tmp_path: Path) -> None:
+    """Counting up by decisions made at once, in their turn and on other threads: none rests on an old state."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    loop = asyncio.get_running_loop()
+
+    def up(now: Record | None) -> Record:
+        count = 1 if now is None else int(now.value) + 1
+        return _record("k", str(count).encode(), count)
+
+    def elsewhere(done: asyncio.Future[None]) -> None:
+        def told(_: Record | None, error: Exception | None) -> None:
+            assert error is None
+            loop.call_soon_threadsafe(done.set_result, None)
+
+        store.change_then("k", up, told)
+
+    waits: list[Awaitable[Any]] = []
+    for number in range(120):
+        if number % 3 == 0:
+            waits += store.change_soon("k", up, durable=number % 2 == 0)
+        elif number % 3 == 1:
+            waits.append(asyncio.create_task(store.change("k", up)))
+        else:
+            waits.append(done := loop.create_future())
+            await asyncio.to_thread(elsewhere, done)
+        if number % 20 == 0:
+            await asyncio.sleep(0.01)
+    await asyncio.gather(*waits)
+    assert await store.record("k") == _record("k", b"120", 120)
+    decided, committed = store.change_soon("k", up)
+    assert decided.done(), "all that it rests on is in memory"
+    # The same again finds it done, and is told so only when it is on the disk.
+    again, kept = store.change_soon("k", lambda now: now)
+    assert (await again, await kept) == (await decided, await committed)
+    await store.close()
 
 
 async def test_any_thread_may_change_a_record(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement
 from appliance.tasks.replan.robots import Robots
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.surroundings import Input, RunNews, task_key
+from appliance.tasks.surroundings import FREE, Input, RunNews, Steered, task_key
 
 FAST = TasksConfig(check_s=0.03, grace_s=0.1, run_timeout_s=0.05)
 
@@ -413,6 +413,7 @@ class FakeRecovery:
         self.new_plan: Plan | Exception = PlanError("no planner is configured")
         self.asked: list[TaskRecord] = []
         self.asking: asyncio.Event | None = None
+        self.forbidden: tuple[str, ...] = ()
 
     @property
     def manifests(self) -> dict[str, SkillManifest]:
@@ -433,6 +434,10 @@ class FakeRecovery:
     def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
         """Remember."""
         self.noted.append(what)
+
+    def against(self, record: TaskRecord, target: SubtaskRecord, plan: Plan, robot: str = "") -> tuple[str, ...]:
+        """Return what the test forbids: robots that take over, skills."""
+        return tuple(f"{each} is forbidden" for each in self.forbidden if each in (robot, plan.subtasks[-1].skill))
 
     async def replan(self, record: TaskRecord) -> Plan:
         """Return the new plan or raise it."""
@@ -469,6 +474,17 @@ class FakeSurroundings:
         self.forgotten: list[str] = []
         self.choice: Choice | None = None
         self.slow_answer: asyncio.Event | None = None
+        self.commands: Any = FREE
+        self.approve_why = ""
+        self.problems: tuple[str, ...] = ()
+
+    def approval(self, record: TaskRecord, plan: Plan) -> str:
+        """Return why the test wants it approved."""
+        return self.approve_why
+
+    def plan_problems(self, record: TaskRecord, plan: Plan) -> tuple[str, ...]:
+        """Return what the test says is wrong."""
+        return self.problems
 
     async def plan(self, record: TaskRecord) -> Plan:
         """Return the plan or raise it."""
@@ -492,6 +508,9 @@ class FakeSurroundings:
         """Gateways in order, those where it failed last."""
         failed = {each.gateway for each in target.attempts if each.failure}
         return Placement(order=tuple(sorted(self.places, key=lambda each: each in failed)), why="none is there")
+
+    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
+        """Nobody keeps a log here."""
 
     def regroup(self, record: TaskRecord) -> Group | None:
         """Return the group that the test says."""
@@ -569,6 +588,13 @@ class Bench:
         """Hand in news."""
         assert self.driver is not None
         self.driver.tell(news)
+
+    async def order(self, ask: Any) -> TaskRecord:
+        """Give an operator's order; returns the record as written with it, or raises why it was not taken."""
+        assert self.driver is not None
+        outcome: asyncio.Future[TaskRecord] = asyncio.get_running_loop().create_future()
+        self.driver.tell(Steered(ask=ask, outcome=outcome))
+        return await asyncio.wait_for(outcome, 5)
 
     async def until(self, holds: Callable[[TaskRecord], bool]) -> TaskRecord:
         """Wait until the record is so."""

@@ -9,23 +9,19 @@ from msgspec.structs import replace
 from appliance.errors import NotFoundError
 from appliance.model import GatewayStatus, RunEvent, RunEventKind, Site, Subtask, SubtaskState, TaskRequest, TaskState
 from appliance.reasons import why_text
-from appliance.tasks import manager as module
 from appliance.tasks.api import RunAsk, RunStatus, WhyAsk
 from appliance.tasks.manager import TaskManager
 
-from .test_manager import FakeExecutor, until
+from .test_manager import AgreeableDecomposer, FakeExecutor, until
 
 pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
-async def manager(
-    plane: Any, tasks_config: Any, catalogue: Any, monkeypatch: pytest.MonkeyPatch
-) -> AsyncIterator[TaskManager]:
+async def manager(plane: Any, tasks_config: Any, catalogue: Any) -> AsyncIterator[TaskManager]:
     """Return a manager of gw-1 that knows three gateways: one full, one draining, one too small."""
-    monkeypatch.setattr(module, "validate", lambda *_, **__: ())
     made = TaskManager(
-        tasks_config, plane=plane, catalogue=catalogue, decomposer=cast("Any", None),
+        tasks_config, plane=plane, catalogue=catalogue, decomposer=cast("Any", AgreeableDecomposer()),
         executor=cast("Any", FakeExecutor()), site=Site(),
     )  # fmt: skip
     plane.registry.gateways = {

@@ -63,6 +63,9 @@ def test_doubled_runs_are_ended_and_later_attempts_fenced_off(plane: Any) -> Non
     (note,) = healing.notes
     assert "s1 (attempt 4 on gw-3: ended now)" in note
     assert "attempt 3 on gw-2: it had succeeded" in note
+    again = heal(replace(record, sequence=record.sequence + 3, coordinator="gw-2"))
+    assert again is not None
+    assert again.noted == healing.noted, "whoever settles it tells it under the same name"
     after = apply(record, _step(4, TransitionKind.HEALED, splits=healing.splits, fences=healing.fences))
     assert heal(after) is None
     assert after.subtasks[0].next_attempt == 5

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from types import SimpleNamespace
 from typing import Any, cast
 
 import msgspec
@@ -10,8 +11,14 @@ from msgspec.structs import replace
 
 from appliance.client import _news
 from appliance.errors import DeadlineError, PayloadError, UnreachableError
+from appliance.llm.cascade import Decomposer
+from appliance.llm.experience.statistic import Experience
+from appliance.llm.safety.settings import SafetyConfig
+from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.model import (
+    Plan,
     PoolHint,
+    RobotInfo,
     RunEvent,
     RunEventKind,
     Site,
@@ -23,9 +30,11 @@ from appliance.model import (
 )  # fmt: skip
 from appliance.plane.dht import Record
 from appliance.pool.api import Hinted
-from appliance.tasks import manager as module
+from appliance.skills.catalogue import load_catalogue
+from appliance.tasks import driving as module
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.manager import TaskManager
+from appliance.tasks.steering.api import CancelTaskAsk
 
 pytestmark = pytest.mark.anyio
 
@@ -43,17 +52,26 @@ class FakeExecutor:
         return Hinted(taken=False, why=f"no pool for {hint.image}")
 
 
+class AgreeableDecomposer:
+    """Finds nothing wrong with a plan that is handed in, and has experience of nothing."""
+
+    def __init__(self) -> None:
+        self.memory = SimpleNamespace(experience=Experience(lambda: 0.0))
+
+    def check(self, plan: Plan, context: PlanContext) -> tuple[str, ...]:
+        """Find nothing."""
+        del plan, context
+        return ()
+
+
 @pytest.fixture
-async def manager(
-    plane: Any, tasks_config: Any, catalogue: Any, monkeypatch: pytest.MonkeyPatch
-) -> AsyncIterator[TaskManager]:
+async def manager(plane: Any, tasks_config: Any, catalogue: Any) -> AsyncIterator[TaskManager]:
     """Return a started manager without gateways, so that tasks wait; stopped afterwards."""
-    monkeypatch.setattr(module, "validate", lambda *_, **__: ())
     made = TaskManager(
         tasks_config,
         plane=plane,
         catalogue=catalogue,
-        decomposer=cast("Any", None),
+        decomposer=cast("Any", AgreeableDecomposer()),
         executor=cast("Any", FakeExecutor()),
         site=Site(),
     )
@@ -131,7 +149,7 @@ async def test_a_task_whose_end_could_not_be_written_is_driven_again(manager: Ta
     await until(lambda: manager._drivers["t-1"].record.state is TaskState.RUNNING)
     await asyncio.sleep(0.05)
     plane.dht.break_next = [UnreachableError("no owner")]
-    await manager.cancel(TaskAsk(id="t-1"))
+    await manager.cancel(CancelTaskAsk(id="t-1"))
     await until(lambda: manager.unfinished == 0)
     await until(lambda: manager.unfinished == 1)
 
@@ -243,3 +261,17 @@ def test_a_watcher_follows_a_coordinator_that_came_back_with_lower_numbers(plane
     assert _news(pushed, replace(pushed, sequence=12, updated_ns=200))
     assert _news(pushed, replace(pushed, sequence=20, state=TaskState.SUCCEEDED))
     assert not _news(pushed, replace(pushed, sequence=40, updated_ns=90))
+
+
+async def test_a_plan_that_a_robot_hands_in_waits_where_the_policy_says_so(manager: TaskManager, plane: Any) -> None:
+    """`confirm_skills` holds for robots' plans too; a person who hands in a plan has seen it."""
+    policy = SafetyConfig(confirm_skills=("push",))
+    manager._decomposer = Decomposer(LlmConfig(tiers=("rules",)), load_catalogue(), safety=policy)
+    plane.registry.robots["rover_1"] = RobotInfo(id="rover_1", kind="zenoh")
+    plan = plane.plan_of(Subtask(id="s1", skill="push", robot="rover_1"))
+    record = plane.accepted(plan=plan)
+    assert record.handed_in
+    assert "safety.confirm_skills" in manager.approval(replace(record, submitter="rover_1"), plan)
+    assert manager.approval(replace(record, submitter="ann"), plan) == ""
+    harmless = plane.plan_of(Subtask(id="s1", skill="hold", robot="rover_1"))
+    assert manager.approval(replace(record, submitter="rover_1"), harmless) == ""

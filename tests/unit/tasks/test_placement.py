@@ -127,6 +127,30 @@ def test_any_prefers_a_robot_that_is_free() -> None:
     assert found == ("rover_1", "")
 
 
+def test_a_robot_that_keeps_failing_at_it_is_chosen_last() -> None:
+    """Experience counts for more than a robot that is busy, and for less than that nobody else can do it."""
+    these = records(Subtask(id="s1", skill="goto", robot="any"))
+    none: dict[str, tuple[str, ...]] = {"s1": ()}
+
+    def chosen(busy: frozenset[str], *shunned: str) -> str | None:
+        return bind(
+            "any",
+            these,
+            robots=ROBOTS,
+            uses=none,
+            verbs=none,
+            busy=busy,
+            shuns=lambda _subtask, robot: "it failed" if robot in shunned else "",
+        )[0]
+
+    first = chosen(frozenset())
+    assert first is not None
+    other = chosen(frozenset(), first)
+    assert other not in (None, first)
+    assert chosen(frozenset(set(ROBOTS) - {first}), first) != first
+    assert chosen(frozenset(), *ROBOTS) == first
+
+
 def test_two_labels_are_two_robots() -> None:
     """`any1` and `any2` do not become the same robot while another can."""
     first = SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="any1"), bound_robot="drone_1")

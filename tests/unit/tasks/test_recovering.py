@@ -11,7 +11,8 @@ from appliance.errors import PlanError
 from appliance.model import Failure, Plan, RunEvent, RunEventKind, Subtask, SubtaskState, TaskState
 from appliance.tasks.api import RunStatus
 from appliance.tasks.replan.settings import ReplanConfig
-from appliance.tasks.surroundings import Agreement, CancelAsked, RunNews
+from appliance.tasks.steering.api import ApproveAsk, RejectAsk
+from appliance.tasks.surroundings import CancelAsked, RunNews
 
 pytestmark = pytest.mark.anyio
 
@@ -28,10 +29,11 @@ def new_plan(*subtasks: Subtask, confidence: float = 0.9) -> Plan:
 
 
 OTHERWISE = new_plan(replace(WORK, id="a"), Subtask(id="b", skill="work", params={"n": 9}, after=("a",)))
+ONCE_MORE = new_plan(replace(WORK, id="a"), Subtask(id="b", skill="work", params={"n": 10}, after=("a",)))
 
 
-async def first_done_second_broken(bench: Any, *more: Subtask) -> None:
-    """Drive a task until its second subtask is given up."""
+async def first_done_second_broken(bench: Any, *more: Subtask, then: str = "") -> None:
+    """Drive a task until its second subtask is given up; `then`: why plans have to be approved from there."""
     bench.around.the_plan = bench.plan_of(WORK, NEXT, *more)
     await bench.start()
     orders = {}
@@ -42,6 +44,7 @@ async def first_done_second_broken(bench: Any, *more: Subtask) -> None:
     bench.tell(orders["s1"], SUCCEEDED, result={"first": True})
     _, request = await bench.ordered()
     assert request.subtask == "s2"
+    bench.around.approve_why = then
     bench.tell(request, FAILED, failure=BROKEN)
 
 
@@ -90,7 +93,7 @@ async def test_an_unsure_plan_waits_for_an_operator(bench: Any) -> None:
     assert "waits for an operator" in record.of("s2").note
     await asyncio.sleep(0.05)
     assert bench.around.orders.empty()
-    bench.say(Agreement(agree=True, by="ann"))
+    await bench.order(ApproveAsk(id="t-1", by="ann"))
     _, request = await bench.ordered()
     assert request.subtask == "r1ltn_1"
 
@@ -107,12 +110,22 @@ async def test_whoever_confirmed_the_first_plan_is_asked_again(bench: Any) -> No
     assert record.proposal.waits
 
 
+async def test_the_approval_rule_counts_for_a_new_plan(bench: Any) -> None:
+    """What must be approved before it runs must be after a failure too, however sure the decomposer is."""
+    bench.around.recovery.new_plan = OTHERWISE
+    await first_done_second_broken(bench, then="s2 flies")
+    record = await bench.until(lambda record: record.proposal is not None or record.replans > 0)
+    assert record.proposal is not None
+    assert record.proposal.waits
+    assert "s2 flies" in record.proposal.note
+
+
 async def test_an_operator_turns_a_plan_down(bench: Any) -> None:
     """The task fails with the first failure, and says who did not agree."""
     bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
     await first_done_second_broken(bench)
     await bench.until(lambda record: record.proposal is not None)
-    bench.say(Agreement(agree=False, by="ann"))
+    await bench.order(RejectAsk(id="t-1", by="ann"))
     ended = await bench.end()
     assert "ann turned the new plan down" in ended.failure.message
 
@@ -124,6 +137,66 @@ async def test_a_proposal_that_nobody_answers_ends(bench: Any) -> None:
     await first_done_second_broken(bench)
     ended = await bench.end()
     assert "no operator agreed" in ended.failure.message
+
+
+async def test_each_proposal_has_the_whole_time_to_be_answered(bench: Any) -> None:
+    """A second one, later than the first one's time, waits for an operator as well."""
+    bench.plane.rpc.on["run_status"] = running
+    bench.around.config = replace(bench.around.config, replan=ReplanConfig(confirm_s=2.0))
+    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    await first_done_second_broken(bench)
+    await bench.until(lambda record: record.proposal is not None)
+    await bench.order(ApproveAsk(id="t-1", by="ann"))
+    _, request = await bench.ordered()
+    bench.tell(request, STARTED)
+    await asyncio.sleep(2.1)
+    bench.around.recovery.new_plan = replace(ONCE_MORE, confidence=0.4)
+    bench.tell(request, FAILED, failure=BROKEN)
+    await bench.until(lambda record: record.proposal is not None or record.state.final)
+    await bench.order(ApproveAsk(id="t-1", by="ann"))
+    _, request = await bench.ordered()
+    bench.tell(request, SUCCEEDED)
+    assert (await bench.end()).state is TaskState.SUCCEEDED
+
+
+async def test_a_takeover_does_not_prolong_the_wait_for_an_operator(bench: Any) -> None:
+    """The next coordinator counts from when the plan was proposed, by the task's own age."""
+    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    await first_done_second_broken(bench)
+    await bench.until(lambda record: record.proposal is not None)
+    async with asyncio.timeout(5):
+        while bench.stored().proposal is None:
+            await asyncio.sleep(0.005)
+    bench.task.cancel()
+    await asyncio.gather(bench.task, return_exceptions=True)
+    await bench.start(bench.stored(), elapsed_s=bench.stored().proposal.expires_s + 60.0)
+    ended = await bench.end()
+    assert "no operator agreed" in ended.failure.message
+
+
+async def test_runs_that_a_second_new_plan_leaves_out_have_the_whole_grace(bench: Any) -> None:
+    """They are asked to end as those of the first one were, however long ago that was."""
+    bench.plane.rpc.on["run_status"] = running
+    bench.around.config = replace(bench.around.config, grace_s=1.0)
+    beside = Subtask(id="c", skill="work", params={"n": 4})
+    bench.around.recovery.new_plan = new_plan(*OTHERWISE.subtasks, beside)
+    await first_done_second_broken(bench, BESIDE)
+    ordered = [(await bench.ordered())[1] for _ in range(2)]  # s3 does not confirm that it ended: after the grace
+    assert bench.driver.record.replans == 1
+    for request in ordered:
+        bench.tell(request, STARTED)
+    bench.around.recovery.new_plan = ONCE_MORE
+    broken, left = sorted(ordered, key=lambda request: request.params["n"], reverse=True)
+    bench.tell(broken, FAILED, failure=BROKEN)
+    async with asyncio.timeout(5):
+        while not any(verb == "run_cancel" and ask.subtask == left.subtask for _, verb, ask in bench.plane.rpc.calls):
+            await asyncio.sleep(0.005)
+    event = replace(last_of(bench.driver.record.of(left.subtask)), kind=SUCCEEDED, result={"late": True}, failure=None)
+    bench.driver.tell(RunNews(event))
+    _, request = await bench.ordered()
+    bench.tell(request, SUCCEEDED)
+    ended = await bench.end()
+    assert ended.of(left.subtask).result == {"late": True}, "the run was given up before it could end"
 
 
 async def test_runs_that_the_new_plan_leaves_out_are_ended_first(bench: Any) -> None:
@@ -174,7 +247,7 @@ async def test_a_coordinator_that_takes_over_does_not_ask_again(bench: Any) -> N
     await asyncio.gather(bench.task, return_exceptions=True)
     bench.plane.gateway = "gw-3"
     await bench.start(bench.stored())
-    bench.say(Agreement(agree=True))
+    await bench.order(ApproveAsk(id="t-1"))
     _, request = await bench.ordered()
     assert request.subtask == "r1ogp_1"
     assert len(bench.around.recovery.asked) == 1

@@ -51,6 +51,20 @@ def test_a_lookup_ends_at_the_owner(names: set[str], target: int, rng: random.Ra
         assert lookup.result.owner == owner
 
 
+@settings(max_examples=60, deadline=None)
+@given(fleets, positions, st.integers(1, 70))
+def test_the_nearest_known_come_before_a_position(names: set[str], target: int, most: int) -> None:
+    """As many as are asked for, by their distance on to the position; whoever stands at it is the first."""
+    me, *others = sorted(names)
+    view = View(me, bound=100)
+    view.hear(others)
+    ranked = sorted(others, key=lambda name: (target - point(name)) % RING_SIZE)
+    assert view.nearest(target, most) == ranked[:most]
+    for place in (me, *others):
+        at = point(place)
+        assert view.nearest(at, most) == sorted(others, key=lambda name: (at - point(name)) % RING_SIZE)[:most]
+
+
 @settings(max_examples=40, deadline=None)
 @given(fleets, positions, st.randoms(use_true_random=False))
 def test_under_failures_a_lookup_ends_at_a_survivor(names: set[str], target: int, rng: random.Random) -> None:

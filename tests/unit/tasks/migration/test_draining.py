@@ -12,7 +12,7 @@ from appliance.model import Need, RunRequest
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.executor import Here
 from appliance.tasks.migration import draining as module
-from appliance.tasks.migration.api import DrainAsk, DrainStateAsk, Reason
+from appliance.tasks.migration.api import DrainAsk, DrainStateAsk, Reason, UndrainAsk
 from appliance.tasks.migration.draining import Draining
 from appliance.tasks.migration.settings import MigrationConfig
 
@@ -146,9 +146,9 @@ async def test_undrained_it_takes_runs_again_unless_it_is_about_to_stop() -> Non
     """Those that are left stay."""
     gateway = Gateway(here("s1", skill="fly"))
     await gateway.it.drain(DrainAsk())
-    state = await gateway.it.undrain(DrainStateAsk())
+    state = await gateway.it.undrain(UndrainAsk())
     assert (state.draining, gateway.draining, gateway.it.text) == (False, False, "")
     assert gateway.runs
     gateway.it.begin(5.0, stopping=True)
-    assert (await gateway.it.undrain(DrainStateAsk())).draining
+    assert (await gateway.it.undrain(UndrainAsk())).draining
     await gateway.it.close()

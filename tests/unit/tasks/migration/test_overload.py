@@ -4,8 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from appliance.model import Need, RunRequest
 from appliance.tasks.migration.budget import Bucket
-from appliance.tasks.migration.overload import Candidate, Load, Overload, Room, cost_s, remaining_s
+from appliance.tasks.migration.overload import Candidate, Load, Overload, Room, cost_s, may_leave, remaining_s
 from appliance.tasks.migration.settings import MigrationConfig
 
 CONFIG = MigrationConfig()
@@ -147,3 +148,25 @@ def test_a_bucket_lets_no_more_through_than_its_rate(pauses: list[float]) -> Non
         while bucket.take(now):
             taken += 1
     assert taken <= 4 + 2 * now + 1e-6
+
+
+SENT = RunRequest(task="t-1", subtask="s1", attempt=1, skill="work", need=Need(image="base"), coordinator="gw-1")
+OTHERS = {"gw-2", "gw-3"}
+
+
+def test_a_run_that_may_be_nowhere_else_is_not_offered() -> None:
+    """One whose submitter allows this gateway alone stays, however long it waits; so does one that nobody sent."""
+    assert may_leave(SENT, "anytime", began=True, others=OTHERS)
+    assert may_leave(replace(SENT, group=("gw-1", "gw-3")), "anytime", began=True, others=OTHERS)
+    assert not may_leave(replace(SENT, group=("gw-1",)), "anytime", began=False, others=OTHERS)
+    assert not may_leave(replace(SENT, coordinator=""), "anytime", began=False, others=OTHERS)
+    assert not may_leave(SENT, "never", began=True, others=OTHERS)
+    assert may_leave(SENT, "never", began=False, others=OTHERS)
+
+
+def test_what_works_makes_room_for_what_may_wait_nowhere_else() -> None:
+    """Two that may only be here wait: two of those that work go, and the two keep the rations for them."""
+    working = [Candidate(id=f"w{number}", elapsed_s=50, expected_s=500, saved=True) for number in range(3)]
+    bound = [Candidate(id=f"b{number}", began=False, mobile=False) for number in range(2)]
+    full = Load(queue=2, capacity=3)
+    assert choose(overloaded(load=full), [*working, *bound], load=full) == ["w0", "w1"]

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from appliance.model import Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord
 from appliance.skills.catalogue import SkillManifest, load_catalogue
 from appliance.tasks import machine
+from appliance.tasks.replan.allowed import remainder
 from appliance.tasks.replan.decide import AskDecomposer, GiveUp, decide
 from appliance.tasks.replan.robots import Rebinding, Robots, another_robot, is_the_robots
 from appliance.tasks.replan.settings import ReplanConfig
@@ -197,6 +198,36 @@ def test_the_order_of_what_is_tried() -> None:
     ):
         found = decide(given_record, given_record.of("s2"), **{**bare, "config": config})
         assert isinstance(found, GiveUp), found
+
+
+def test_what_the_policy_forbids_is_not_tried() -> None:
+    """A robot that may not take over gives way to one that may, a skill to the next option; why is told."""
+    record = given_up((GOTO, PHOTO), "s2", OFFLINE)
+    three = Robots(roster={**ROBOTS.roster, "rover_3": rover("rover_3")})
+    given: dict[str, Any] = {"manifests": SKILLS, "robots": three, "config": CONFIG}
+    target = record.of("s2")
+
+    def not_rover_2(plan: Plan, robot: str) -> tuple[str, ...]:
+        del plan
+        return ("rover_2 may not do this",) if robot == "rover_2" else ()
+
+    found = decide(record, target, **given, against=not_rover_2)
+    assert isinstance(found, Rebinding)
+    assert found.robot == "rover_3"
+    nothing = decide(record, target, **given, against=lambda plan, _: (f"no {plan.subtasks[-1].skill}",))
+    assert isinstance(nothing, AskDecomposer)
+    assert "rover_2 may not take over: no goto" in nothing.note
+    assert "may not take its place" in nothing.note
+
+
+def test_what_is_left_of_a_revised_plan_names_who_is_to_do_it() -> None:
+    """What is done is left out, the label of the robot that failed is the robot that takes over."""
+    record = given_up((GOTO, PHOTO), "s2", OFFLINE)
+    assert record.plan is not None
+    (rest,) = remainder(record, record.of("s2"), record.plan, "rover_2").subtasks
+    assert (rest.id, rest.robot, rest.after) == ("s2", "rover_2", ())
+    (same,) = remainder(record, record.of("s2"), record.plan, "").subtasks
+    assert same.robot == "rover_1"
 
 
 def test_a_confirmed_plan_of_the_decomposer_may_be_planned_anew() -> None:

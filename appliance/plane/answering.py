@@ -1,0 +1,136 @@
+"""Answering questions: each in a task of its own, bounded, every defect of a handler contained here."""
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+import structlog
+import zenoh
+
+from appliance.errors import PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane import link
+from appliance.plane.doors import Doors
+from appliance.plane.wire import Closer, Wire
+
+log = structlog.get_logger(__name__)
+
+Answer = Callable[[bytes | None, SwiftbotError | None], None]
+"""Answers one query, from any thread."""
+
+
+class Answering:
+    """What is served on one session."""
+
+    def __init__(self, wire: Wire, doors: Doors) -> None:
+        self._wire = wire
+        self._doors = doors
+        self._answering: set[asyncio.Task[None]] = set()
+
+    def serve(
+        self,
+        expr: str,
+        handler: Callable[[str, bytes], Awaitable[bytes]],
+        *,
+        bulk: bool = False,
+        at_once: Callable[[bytes, Answer], bool] | None = None,
+    ) -> Closer:
+        """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
+
+        `bulk`: answers are raw bytes and wait in a queue of their own; their priority is that of the question.
+        `at_once`: tried first for direct questions, on Zenoh's own thread: it must neither block nor touch what
+        belongs to the event loop. It says whether it answers, or has another thread answer; if not, the handler does.
+
+        A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
+        and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
+
+        A question that was meant for another key is refused as `unreachable`: after links were made anew Zenoh 1.10 has
+        been seen to deliver a query to the wrong queryable of a session or process, which made one robot do another's
+        command. `query` writes down for whom it is; what other Zenoh clients ask says nothing of it.
+        """
+        limit, running, name = self._wire.config.max_payload_bytes, set[asyncio.Task[None]](), self._wire.name(expr)
+
+        def take(query: zenoh.Query) -> None:
+            key, payload = str(query.key_expr), query.payload
+            size = len(payload) if payload is not None else 0
+            direct, meant = link.read_mark(query)
+            if meant and "*" not in expr and meant != expr.encode():
+                error = UnreachableError(f"{expr}: {link.WRONG_DOOR}", remedy="ask again in a moment")
+                begin = partial(self._misrouted, name, query, expr, link.asker_of(query), error)
+                size = 0
+            elif size > limit:
+                error = PayloadError(f"{key}: {size:,} bytes", remedy=f"at most {limit:,}")
+                begin = partial(self._refuse_query, f"oversize {name}", query, expr, error)
+                size = 0
+            else:
+                data = payload.to_bytes() if payload is not None else b""
+                if at_once is not None and direct and at_once(data, partial(link.reply_direct, query, expr)):
+                    return
+                begin = partial(answer, key, data, query)
+            if not self._wire.inbox.post(begin, size):
+                link.reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
+
+        def answer(key: str, data: bytes, query: zenoh.Query) -> None:
+            if len(running) >= self._wire.config.concurrent_queries:
+                error = RefusedError(f"{key}: {len(running)} queries are being answered", remedy="try again later")
+                self._refuse_query(f"too many {name}", query, expr, error)
+                return
+            task = self._wire.loop.create_task(self._answer(handler, key, data, query, expr, bulk=bulk))
+            for group in (running, self._answering):
+                group.add(task)
+                task.add_done_callback(group.discard)
+
+        queryable = self._wire.raw.declare_queryable(expr, zenoh.handlers.Callback(take, indirect=False), complete=True)
+        return Closer(queryable.undeclare)
+
+    async def _answer(
+        self,
+        handler: Callable[[str, bytes], Awaitable[bytes]],
+        key: str,
+        data: bytes,
+        query: zenoh.Query,
+        expr: str,
+        *,
+        bulk: bool,
+    ) -> None:
+        reply: bytes | None = None
+        error: SwiftbotError | None = None
+        try:
+            reply = await handler(key, data)
+            if len(reply) > self._wire.config.max_payload_bytes:
+                error = PayloadError(f"{key}: the answer has {len(reply):,} bytes", remedy="ask for less at once")
+        except SwiftbotError as refusal:
+            if isinstance(refusal, PayloadError):
+                self._wire.refuse(f"malformed {self._wire.name(expr)}", key=key, reason=str(refusal))
+            error = refusal
+        except asyncio.CancelledError:
+            error = UnreachableError("whoever was asked is stopping", remedy="ask another gateway")
+            raise
+        except Exception as defect:  # the supervision boundary of `serve`
+            log.exception("a query's handler failed", key=key)
+            error = SwiftbotError(f"{type(defect).__name__}: {defect}")
+        finally:
+            size = len(reply) if reply is not None and error is None else 0
+            if self._wire.closed:
+                link.reply(query, expr, reply, error)
+            elif link.is_direct(query):
+                link.reply_direct(query, expr, reply, error)
+            else:
+                self._wire.send(key, partial(link.reply, query, expr, reply, error, bulk=bulk), size, bulk=bulk)
+
+    def _misrouted(self, name: str, query: zenoh.Query, expr: str, asker: str, error: SwiftbotError) -> None:
+        """Refuse a question for another key; the links over which it came may be mixed up."""
+        self._refuse_query(f"misrouted {name}", query, expr, error)
+        self._doors.was_wrong(asker)
+
+    def _refuse_query(self, what: str, query: zenoh.Query, expr: str, error: SwiftbotError) -> None:
+        self._wire.refuse(what, key=str(query.key_expr), reason=str(error))
+        self._wire.send(expr, partial(link.reply, query, expr, None, error), 0)
+
+    async def stop(self, wait_s: float) -> None:
+        """End every answer under way with an error, waiting at most so long for handlers that tidy up."""
+        for task in tuple(self._answering):
+            task.cancel()
+        if self._answering:
+            await asyncio.wait(self._answering, timeout=wait_s)

@@ -1,0 +1,158 @@
+"""Asking whoever serves a key, or everybody: bounded in time and size, and over when the session closes."""
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import cast
+
+import structlog
+import zenoh
+
+from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
+from appliance.plane import link
+from appliance.plane.doors import Doors
+from appliance.plane.publishing import Message
+from appliance.plane.wire import Wire
+
+log = structlog.get_logger(__name__)
+
+
+class Asking:
+    """The questions under way of one session."""
+
+    def __init__(self, wire: Wire, doors: Doors) -> None:
+        self._wire = wire
+        self._doors = doors
+        self._asking: set[asyncio.Future[bytes]] = set()
+
+    async def query(
+        self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
+    ) -> bytes:
+        """Ask whoever serves a key and return the first answer; `bulk`: other messages go before it.
+
+        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full. For small
+        questions that can be asked again, where the way there and back matters.
+
+        Raises:
+            UnreachableError: nobody serves the key, or whoever did went away before answering.
+            DeadlineError: no answer within `timeout_s` seconds.
+            PayloadError: the request or the answer is too large.
+            SwiftbotError: what the answering side raised.
+        """
+        direct = direct and len(payload) <= link.MOST_DIRECT
+        until = self._wire.loop.time() + timeout_s
+        answer: asyncio.Future[bytes] = self._wire.loop.create_future()
+        self._asking.add(answer)
+
+        def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
+            if not answer.done():
+                if error is not None:
+                    answer.set_exception(error)
+                elif data is not None:
+                    answer.set_result(data)
+
+        def on_end() -> None:
+            if not answer.done():
+                answer.set_exception(
+                    UnreachableError(f"nobody answers on {key}", remedy="is that gateway or robot up and linked?")
+                )
+
+        try:
+            target = zenoh.QueryTarget.BEST_MATCHING
+            meant = link.mark(key, direct=direct)
+            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, direct=direct, meant=meant)
+            async with asyncio.timeout_at(until):
+                data = await answer
+            if data or not direct:
+                return data
+        except TimeoutError:
+            raise DeadlineError(f"no answer on {key} within {timeout_s:g} s") from None
+        finally:
+            self._asking.discard(answer)
+            answer.cancel()
+        # The answer is too large to be sent so.
+        return await self.query(key, payload, timeout_s=max(0.0, until - self._wire.loop.time()), bulk=bulk)
+
+    async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
+        """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out."""
+        messages: list[Message] = []
+        ended = asyncio.Event()
+
+        def on_reply(key: str, data: bytes | None, error: SwiftbotError | None) -> None:
+            if data is not None:
+                messages.append(Message(key, data, deleted=False, at_ns=time.time_ns(), encoding="application/json"))
+            elif error is not None:
+                log.debug("an answer is an error", expr=expr, error=str(error))
+
+        self._get(expr, payload, timeout_s, on_reply, ended.set, target=zenoh.QueryTarget.ALL)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return list(messages)
+
+    def _get(
+        self,
+        expr: str,
+        payload: bytes,
+        timeout_s: float,
+        on_reply: Callable[[str, bytes | None, SwiftbotError | None], None],
+        on_end: Callable[[], None],
+        *,
+        target: zenoh.QueryTarget,
+        bulk: bool = False,
+        direct: bool = False,
+        meant: bytes | None = None,
+    ) -> None:
+        limit = self._wire.config.max_payload_bytes
+        if len(payload) > limit:
+            raise PayloadError(f"a request of {len(payload):,} bytes on {expr}", remedy=f"at most {limit:,}")
+        if self._wire.closed:
+            raise UnreachableError("the session is closed")
+
+        def take(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is None:
+                error = link.error_of(reply.err)
+                if link.WRONG_DOOR in error.message:
+                    replier = str(reply.replier_id.zid) if reply.replier_id is not None else ""
+                    self._wire.inbox.post(partial(self._doors.met_wrong, replier))
+                self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
+            elif (size := len(sample.payload)) > limit:
+                self._wire.inbox.post(partial(self._wire.refuse, "oversize answer", key=expr, size=size))
+                error = PayloadError(f"the answer on {expr} has {size:,} bytes", remedy=f"at most {limit:,}")
+                self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
+            else:
+                data = sample.payload.to_bytes()
+                self._wire.inbox.post(partial(on_reply, str(sample.key_expr), data, None), size, must=True)
+
+        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
+        control = zenoh.CongestionControl
+        send = partial(
+            self._wire.raw.get,
+            expr,
+            zenoh.handlers.Callback(take, drop=partial(self._wire.inbox.post, on_end, must=True), indirect=False),
+            target=target,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
+            timeout=timeout_s + 1.0,
+            congestion_control=control.DROP if direct else control.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH if direct else priority,
+            express=True,
+            payload=payload,
+            attachment=meant,
+            source_info=self._wire.source,
+        )
+        if direct:
+            link.quietly(cast("Callable[[], None]", send), expr)
+        else:
+            self._wire.send(expr, cast("Callable[[], None]", send), len(payload))
+
+    def stop(self) -> None:
+        """End every question under way with an error."""
+        for answer in self._asking:
+            if not answer.done():
+                answer.set_exception(UnreachableError("the session was closed"))

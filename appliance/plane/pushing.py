@@ -1,0 +1,104 @@
+"""Copies of a record on their way to its replicas: with a write, again to one that was too slow, after a quorum."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
+
+import structlog
+
+from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane.membership import Membership
+from appliance.plane.messages import Found, StoreAsk
+from appliance.plane.rpc import Rpc
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.store import Store
+from appliance.plane.versions import Record
+
+log = structlog.get_logger(__name__)
+
+_ASK_S = 1.5
+_AGAIN_S = (0.5, 2.0)
+"""When a replica that was too slow for a write is offered the record again."""
+_MOST = 256
+
+
+class Pushing:
+    """The copies that one gateway gives to others. `keep` stores here what a replica holds instead."""
+
+    def __init__(
+        self,
+        config: PlaneConfig,
+        *,
+        gateway: str,
+        store: Store,
+        rpc: Rpc,
+        membership: Membership,
+        keep: Callable[[Record], Awaitable[Record]],
+    ) -> None:
+        self._config = config
+        self._gateway = gateway
+        self._store = store
+        self._rpc = rpc
+        self._membership = membership
+        self._keep = keep
+        self._pushes: set[asyncio.Task[None]] = set()
+
+    async def push(self, gateway: str, record: Record, *, durable: bool = True) -> Record | None:
+        """Have a replica store a record; returns what it holds if that is something else."""
+        timeout_s = self._config.replica_timeout_s
+        try:
+            ask = StoreAsk(record, durable)
+            answer = await self._rpc.call(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
+        except UnreachableError:
+            return None  # gone: its successor in the replica set takes the record when it reconciles
+        except (DeadlineError, RefusedError) as error:
+            log.warning("a replica is slow", replica=gateway, key=record.key, reason=str(error))
+            self._later(self._push_again(gateway, record.key))
+            return None
+        except SwiftbotError as error:
+            log.error(  # noqa: TRY400 - the replica's own reason says more than our traceback
+                "a replica cannot store", replica=gateway, key=record.key, reason=str(error)
+            )
+            return None
+        return answer.record
+
+    async def learn(self, record: Record) -> None:
+        """A quorum has chosen a record: the ordinary copies follow, while the writer goes on."""
+        if len(self._pushes) >= _MOST:
+            await self._spread(record)
+        else:
+            self._later(self._spread(record))
+
+    async def _spread(self, record: Record) -> None:
+        with contextlib.suppress(SwiftbotError):  # nobody to hold a copy is reached: a later one comes with the next
+            holders = await self._membership.holders(record.key, self._config.replicas)
+            if self._gateway in holders:
+                await self._keep(record)
+            await asyncio.gather(*(self.push(each, record) for each in holders if each != self._gateway))
+
+    def _later(self, push: Coroutine[Any, Any, None]) -> None:
+        if len(self._pushes) >= _MOST:
+            push.close()  # anti-entropy will find it
+            return
+        task = asyncio.create_task(push)
+        self._pushes.add(task)
+        task.add_done_callback(self._pushes.discard)
+
+    async def _push_again(self, gateway: str, key: str) -> None:
+        for wait_s in _AGAIN_S:
+            await asyncio.sleep(wait_s)
+            record = await self._store.record(key)
+            if record is None or gateway not in self._membership.members:
+                return
+            with contextlib.suppress(SwiftbotError):
+                answer = await self._rpc.call(gateway, "dht_store", StoreAsk(record), Found, timeout_s=_ASK_S)
+                if answer.record is not None:
+                    await self._keep(answer.record)
+                return
+
+    async def close(self) -> None:
+        """Give up what is on its way."""
+        for task in self._pushes:
+            task.cancel()
+        await asyncio.gather(*self._pushes, return_exceptions=True)

@@ -1,0 +1,117 @@
+"""The audit of operators' orders: who ordered what of whom, why, and what came of it, on one key and in the log."""
+
+import time
+import uuid
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import TypeVar, cast
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import SwiftbotError
+from appliance.model import Act, Signed, encode
+from appliance.plane.keys import Keys
+from appliance.plane.session import Closer, Session
+from appliance.tasks.bounds import clean
+from appliance.tasks.steering.api import ActList, ActsAsk
+
+log = structlog.get_logger(__name__)
+
+KEPT = 500
+"""Orders that a gateway remembers for those who ask, its own and others'; the log on disk has all."""
+MAX_PROBLEM = 1000
+_TARGETS = ("id", "task", "robot", "robots", "container", "image", "folder")
+
+Q = TypeVar("Q", bound=Signed)
+R = TypeVar("R", bound=Struct)
+
+
+class Audit:
+    """One per gateway. `signed` puts an audit around what answers an operator's verb."""
+
+    def __init__(self, session: Session, keys: Keys, gateway: str) -> None:
+        self._session = session
+        self._keys = keys
+        self._gateway = gateway
+        self._acts: deque[Act] = deque(maxlen=KEPT)
+
+    def listen(self) -> Closer:
+        """Remember what was ordered of others too: a gateway that dies takes no order along."""
+        return self._session.subscribe_typed(self._keys.act(), Act, self._on_act)
+
+    def _on_act(self, key: str, act: Act | None) -> None:
+        if act is not None and act.gateway != self._gateway and key.endswith(f"/{act.gateway}"):
+            self._acts.append(act)
+
+    def signed(
+        self, verb: str, handler: Callable[[Q], Awaitable[R]], *, when: Callable[[Q], bool] = lambda _: True
+    ) -> Callable[[Q], Awaitable[R]]:
+        """Return the handler with an audit around it; what gateways hand on to each other (`here`) has none.
+
+        Args:
+            verb: as it is registered.
+            handler: what answers.
+            when: whether a request is an operator's at all.
+        """
+
+        async def answer(ask: Q) -> R:
+            if getattr(ask, "here", False) or not when(ask):
+                return await handler(ask)
+            began = time.monotonic()
+            try:
+                reply = await handler(ask)
+            except SwiftbotError as error:
+                self._note(verb, ask, began, error.code, error.message)
+                raise
+            except Exception as error:
+                self._note(verb, ask, began, "internal", f"{type(error).__name__}: {error}")
+                raise
+            self._note(verb, ask, began, "done", "")
+            return reply
+
+        return answer
+
+    def _note(self, verb: str, ask: Signed, began: float, outcome: str, problem: str) -> None:
+        act = Act(
+            id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
+            verb=verb,
+            by=clean(ask.by, 120) or "unsigned",
+            target=target_of(ask),
+            why=clean(ask.why, 500),
+            outcome=outcome,
+            problem=clean(problem, MAX_PROBLEM),
+            gateway=self._gateway,
+            at_ns=time.time_ns(),
+            took_ms=round((time.monotonic() - began) * 1e3, 2),
+        )
+        self._acts.append(act)
+        self._session.put(self._keys.act(self._gateway), encode(act))
+        log.info(
+            "operator's order",
+            verb=verb,
+            by=act.by,
+            target=act.target,
+            why=act.why,
+            outcome=outcome,
+            problem=act.problem,
+            act=act.id,
+        )
+
+    async def acts(self, ask: ActsAsk) -> ActList:
+        """Answer `acts`."""
+        newest = list(self._acts)[::-1]
+        return ActList(acts=tuple(newest[: max(0, ask.limit)]))
+
+
+def target_of(ask: Signed) -> str:
+    """What an order is about, by the fields that such requests have."""
+    found: list[str] = []
+    for name in _TARGETS:
+        value: object = getattr(ask, name, "")
+        if isinstance(value, tuple):
+            found.append(", ".join(cast("tuple[str, ...]", value)) or "the fleet")
+        elif value:
+            found.append(str(value))
+    subtask = str(getattr(ask, "subtask", "") or "")
+    return clean("/".join([*found, *([subtask] if subtask else [])]), 300)

@@ -1,0 +1,69 @@
+"""The audit: every order leaves a mark, whatever came of it."""
+
+from typing import Any
+
+import pytest
+
+from appliance.errors import ConflictError
+from appliance.model import Act, TaskRecord, encode
+from appliance.robots.authority.api import StopAsk
+from appliance.tasks.steering.api import ActsAsk, PauseAsk, RetryAsk
+from appliance.tasks.steering.audit import KEPT, Audit, target_of
+
+pytestmark = pytest.mark.anyio
+
+
+async def done(ask: PauseAsk) -> TaskRecord:
+    """Carry out an order."""
+    return TaskRecord(id=ask.id, instruction="x")
+
+
+async def late(ask: PauseAsk) -> TaskRecord:
+    """Come second."""
+    raise ConflictError("ann was faster")
+
+
+async def broken(ask: PauseAsk) -> TaskRecord:
+    """Break."""
+    raise ValueError("a defect")
+
+
+async def test_what_came_of_an_order_is_put(plane: Any) -> None:
+    """Done, refused and broken ones, with who, what, why and when; what gateways hand on is no order of its own."""
+    audit = Audit(plane.session, plane.keys, "gw-1")
+    await audit.signed("pause", done)(PauseAsk(id="t-1", by="ann", why="lunch", act="o-1"))
+    with pytest.raises(ConflictError):
+        await audit.signed("pause", late)(PauseAsk(id="t-1", by="bob"))
+    with pytest.raises(ValueError, match="a defect"):
+        await audit.signed("pause", broken)(PauseAsk(id="t-1"))
+    await audit.signed("pause", done)(PauseAsk(id="t-1", by="ann", here=True))
+    await audit.signed("pause", done, when=lambda _: False)(PauseAsk(id="t-1", by="ann"))
+    told = plane.session.sent(plane.keys.act("gw-1"), Act)
+    assert [(each.by, each.target, each.outcome) for each in told] == [
+        ("ann", "t-1", "done"),
+        ("bob", "t-1", "conflict"),
+        ("unsigned", "t-1", "internal"),
+    ]
+    assert (told[0].id, told[0].why) == ("o-1", "lunch")
+    assert told[1].problem == "ann was faster"
+    newest = (await audit.acts(ActsAsk(limit=2))).acts
+    assert [each.by for each in newest] == ["unsigned", "bob"]
+
+
+async def test_orders_given_to_other_gateways_are_remembered(plane: Any) -> None:
+    """One that dies takes none along; one that says it is another's is not believed; the number is bounded."""
+    audit = Audit(plane.session, plane.keys, "gw-1")
+    audit.listen()
+    plane.session.put(plane.keys.act("gw-2"), encode(Act(id="a", verb="stop", by="ann", gateway="gw-2")))
+    plane.session.put(plane.keys.act("gw-3"), encode(Act(id="b", verb="stop", by="eve", gateway="gw-2")))
+    assert [each.id for each in (await audit.acts(ActsAsk())).acts] == ["a"]
+    for number in range(KEPT + 10):
+        plane.session.put(plane.keys.act("gw-2"), encode(Act(id=f"n{number}", verb="x", by="ann", gateway="gw-2")))
+    assert len((await audit.acts(ActsAsk(limit=10_000))).acts) == KEPT
+
+
+def test_an_order_names_what_it_is_about() -> None:
+    """A task, its subtask, robots, or the fleet."""
+    assert target_of(RetryAsk(id="t", subtask="s1")) == "t/s1"
+    assert target_of(StopAsk(robots=("r1", "r2"))) == "r1, r2"
+    assert target_of(StopAsk()) == "the fleet"

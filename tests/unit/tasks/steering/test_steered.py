@@ -1,0 +1,412 @@
+"""Operators' orders on a driven task: approval, pauses, retries; and what soft stops and leases mean for it."""
+
+import asyncio
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from appliance.errors import ConflictError, NotFoundError, PlanError, RefusedError, SwiftbotError
+from appliance.model import (
+    Failure,
+    RunEventKind,
+    SoftStop,
+    Subtask,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+    encode,
+)
+from appliance.tasks import machine
+from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.keeper import Keeper
+from appliance.tasks.migration.api import Held
+from appliance.tasks.steering.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
+from appliance.tasks.steering.driving import revived
+from appliance.tasks.steering.hashing import plan_hash
+from appliance.tasks.surroundings import CancelAsked, Wake
+
+pytestmark = pytest.mark.anyio
+
+ON_ROBOT = (Subtask(id="s1", skill="work", robot="r1"), Subtask(id="s2", skill="work", after=("s1",)))
+
+
+async def proposed(bench: Any) -> TaskRecord:
+    """Have a task whose first plan waits."""
+    bench.around.approve_why = "every plan is approved first"
+    await bench.start()
+    return await bench.until(lambda record: record.state is TaskState.PROPOSED)
+
+
+def fold(bench: Any) -> TaskRecord:
+    """Fold the published transitions over what was accepted, as a replay of the log does."""
+    record = bench.plane.accepted()
+    for each in bench.transitions():
+        record = machine.apply(record, each)
+    return record
+
+
+def same(one: TaskRecord, other: TaskRecord) -> bool:
+    """Whether two records tell the same."""
+    return msgspec.to_builtins(one) == msgspec.to_builtins(other)
+
+
+async def test_a_plan_that_waits_runs_when_it_is_approved(bench: Any) -> None:
+    """Nothing is sent before; the record says why it waits, by which hash, and then who approved it."""
+    record = await proposed(bench)
+    assert record.proposal.note == "every plan is approved first"
+    assert record.proposal.hash == plan_hash(bench.around.the_plan)
+    assert record.proposal.expires_s == 600.0
+    await asyncio.sleep(0.05)
+    assert bench.around.orders.empty()
+    ask = ApproveAsk(id="t-1", hash=record.proposal.hash[:12], by="ann", why="looks right", act="o-1")
+    approved = await bench.order(ask)
+    assert approved.state is TaskState.RUNNING
+    assert (approved.decision.by, approved.decision.why, approved.decision.edited) == ("ann", "looks right", False)
+    assert bench.stored().decision == approved.decision
+    _, request = await bench.ordered()
+    assert request.subtask == "s1"
+    assert same(fold(bench), bench.driver.told)
+    again = await bench.order(ask)  # the answer was lost: the same order is done once
+    assert again.decision == approved.decision
+
+
+async def test_of_two_operators_one_wins_and_the_other_hears_who(bench: Any) -> None:
+    """The second gets `conflict` with the first one's name and verdict, whatever they wanted."""
+    record = await proposed(bench)
+    given = record.proposal.hash
+    asks = [
+        ApproveAsk(id="t-1", hash=given, by="ann", act="a"),
+        RejectAsk(id="t-1", hash=given, by="bob", act="b"),
+        ApproveAsk(id="t-1", hash=given, by="cy", act="c"),
+    ]
+    outcomes = await asyncio.gather(*(bench.order(each) for each in asks), return_exceptions=True)
+    assert isinstance(outcomes[0], TaskRecord)
+    for late in outcomes[1:]:
+        assert isinstance(late, ConflictError)
+        assert "ann has approved" in late.message
+
+
+async def test_an_edited_plan_is_checked_before_it_is_taken(bench: Any) -> None:
+    """What is wrong comes back as problems and the task waits on; a valid one runs, and the record says edited."""
+    record = await proposed(bench)
+    edited = bench.plan_of(Subtask(id="s1", skill="work", params={"n": 2}))
+    bench.around.problems = ("s1: there is no dock 9",)
+    with pytest.raises(PlanError) as refused:
+        await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
+    assert refused.value.problems == ("s1: there is no dock 9",)
+    assert bench.driver.record.state is TaskState.PROPOSED
+    bench.around.problems = ()
+    await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
+    _, request = await bench.ordered()
+    assert request.params == {"n": 2}
+    assert bench.driver.record.decision.edited
+    assert same(fold(bench), bench.driver.told)
+
+
+async def test_an_approval_is_bound_to_the_hash(bench: Any) -> None:
+    """Another hash is a conflict, and one that is too short means none."""
+    await proposed(bench)
+    with pytest.raises(ConflictError, match="another one"):
+        await bench.order(ApproveAsk(id="t-1", hash="0" * 64, by="ann"))
+    with pytest.raises(RefusedError, match="too short"):
+        await bench.order(ApproveAsk(id="t-1", hash="ab", by="ann"))
+    assert bench.driver.record.state is TaskState.PROPOSED
+
+
+async def test_a_plan_that_is_turned_down_cancels_its_task(bench: Any) -> None:
+    """Nothing has run; who said no and why is in the record, and later orders are told of it."""
+    await proposed(bench)
+    await bench.order(RejectAsk(id="t-1", by="ann", why="the dock is closed"))
+    ended = await bench.end()
+    assert ended.state is TaskState.CANCELLED
+    assert (ended.cancelled_by.by, ended.cancelled_by.why) == ("ann", "the dock is closed")
+    assert same(fold(bench), ended)
+
+
+async def test_a_plan_that_nobody_approves_expires(bench: Any) -> None:
+    """The task fails with the reason, by its own clock, whoever coordinated it before."""
+    bench.around.config = replace(bench.around.config, approval_s=0.05)
+    bench.around.approve_why = "every plan is approved first"
+    await bench.start()
+    ended = await bench.end()
+    assert ended.state is TaskState.FAILED
+    assert "no operator approved its plan" in ended.failure.message
+
+
+async def test_a_successor_waits_on_with_the_same_proposal(bench: Any) -> None:
+    """It does not plan again; the approval given to it counts."""
+    record = await proposed(bench)
+    async with asyncio.timeout(5):
+        while bench.stored().proposal is None:
+            await asyncio.sleep(0.005)
+    bench.task.cancel()
+    await asyncio.gather(bench.task, return_exceptions=True)
+    bench.plane.gateway = "gw-3"
+    bench.around.the_plan = PlanError("must not be asked again")
+    await bench.start(bench.stored())
+    await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash))
+    _, request = await bench.ordered()
+    assert request.subtask == "s1"
+
+
+async def test_cancel_while_a_plan_waits(bench: Any) -> None:
+    """It ends at once as cancelled."""
+    await proposed(bench)
+    bench.say(CancelAsked())
+    assert (await bench.end()).state is TaskState.CANCELLED
+
+
+async def test_a_paused_task_starts_nothing_and_goes_on_when_resumed(bench: Any) -> None:
+    """What runs goes on to its end; its successor waits with the reason until somebody resumes."""
+    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
+    await bench.start()
+    _, request = await bench.ordered()
+    record = await bench.order(PauseAsk(id="t-1", by="ann", why="lunch", act="p"))
+    assert record.paused == "paused by ann: lunch"
+    with pytest.raises(ConflictError, match="paused by ann"):
+        await bench.order(PauseAsk(id="t-1", by="bob", act="q"))
+    bench.tell(request, RunEventKind.SUCCEEDED, result={})
+    await bench.until(lambda record: record.of("s2").state is SubtaskState.READY)
+    bench.say(Wake())
+    await asyncio.sleep(0.05)
+    assert bench.around.orders.empty()
+    await bench.order(ResumeAsk(id="t-1", by="bob"))
+    _, request = await bench.ordered()
+    assert request.subtask == "s2"
+    assert same(fold(bench), bench.driver.told)
+
+
+async def test_a_pause_with_hold_ends_runs_that_save_checkpoints(bench: Any) -> None:
+    """Such a run is made ready to leave, ended, and goes on as the next attempt; another one is left alone."""
+    bench.around.skills = {
+        "work": replace(bench.around.skills["work"], checkpoints=True),
+        "plain": replace(bench.around.skills["work"], id="plain", checkpoints=False),
+    }
+    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="plain"))
+    cancelled: list[str] = []
+
+    async def hold(gateway: str, ask: Any) -> Any:
+        return Held(began=True, fresh=True, saved=True, hold_s=5.0)
+
+    async def cancel(gateway: str, ask: RunAsk) -> RunStatus:
+        cancelled.append(ask.run_id)
+        return RunStatus(running=False)
+
+    bench.plane.rpc.on |= {"run_hold": hold, "run_cancel": cancel}
+    await bench.start()
+    requests = {(await bench.ordered())[1].subtask for _ in range(2)}
+    assert requests == {"s1", "s2"}
+    await bench.order(PauseAsk(id="t-1", by="ann", hold=True))
+    record = await bench.until(lambda record: record.of("s1").state is SubtaskState.READY)
+    assert record.of("s1").attempts[0].left.startswith("held at its checkpoint")
+    assert record.of("s2").state in (SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+    async with asyncio.timeout(5):
+        while not cancelled:
+            await asyncio.sleep(0.005)
+    assert cancelled == ["t-1/s1/1"]
+    await bench.order(ResumeAsk(id="t-1", by="ann"))
+    _, request = await bench.ordered()
+    assert (request.subtask, request.attempt) == ("s1", 2)
+    assert same(fold(bench), bench.driver.told)
+
+
+class Stopping:
+    """Soft stops and leases in the test's hands."""
+
+    def __init__(self) -> None:
+        self.active: tuple[SoftStop, ...] = ()
+        self.over: set[str] = set()
+        self.lease = ""
+
+    def holds(self, stop: SoftStop, robot: str) -> bool:
+        """Whether it is one of its robots."""
+        return stop in self.active and (not stop.robots or robot in stop.robots)
+
+    def ended(self, stop: str, robots: Any) -> bool:  # noqa: ARG002 - as Commands has it
+        """Whether the test has lifted it."""
+        return stop in self.over
+
+    def hindrance(self, robot: str) -> str:
+        """The first stop, or the lease."""
+        return next((each.text for each in self.active if self.holds(each, robot)), self.lease)
+
+    def lift(self) -> None:
+        """Lift all."""
+        self.over |= {each.id for each in self.active}
+        self.active = ()
+
+
+async def test_a_soft_stop_pauses_tasks_of_the_robot_and_its_lifting_resumes_them(bench: Any) -> None:
+    """The run is ended and counts for no failure, its late news is fenced off, and the next attempt follows."""
+    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.around.commands = stopping = Stopping()
+
+    async def cancel(gateway: str, ask: RunAsk) -> RunStatus:
+        return RunStatus(running=False)
+
+    bench.plane.rpc.on["run_cancel"] = cancel
+    await bench.start()
+    _, request = await bench.ordered()
+    bench.tell(request, RunEventKind.STARTED)
+    await bench.until(lambda record: record.of("s1").state is SubtaskState.RUNNING)
+    stopping.active = (SoftStop(id="st-1", robots=("r1",), by="ann", why="a person"),)
+    bench.say(Wake())
+    record = await bench.until(lambda record: bool(record.pauses))
+    assert record.paused == "r1 stopped by ann: a person"
+    assert record.of("s1").state is SubtaskState.READY
+    broken = Failure(code="robot", message="stopped on request")
+    bench.tell(request, RunEventKind.FAILED, failure=broken)
+    with pytest.raises(RefusedError, match="goes on when the stop is lifted"):
+        await bench.order(ResumeAsk(id="t-1", by="bob"))
+    await asyncio.sleep(0.05)
+    assert bench.around.orders.empty()
+    assert bench.driver.record.of("s1").failure is None
+    stopping.lift()
+    bench.say(Wake())
+    _, request = await bench.ordered()
+    assert request.attempt == 2
+    assert bench.driver.record.paused == ""
+    assert same(fold(bench), bench.driver.told)
+
+
+async def test_a_stop_that_is_not_known_here_keeps_a_task_paused(bench: Any) -> None:
+    """A successor that has not heard of the stop must not resume: only one that is known to be lifted ends a pause."""
+    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.around.commands = stopping = Stopping()
+    stopping.active = (SoftStop(id="st-1", by="ann"),)
+    await bench.start()
+    await bench.until(lambda record: bool(record.pauses))
+    stopping.active = ()
+    bench.say(Wake())
+    await asyncio.sleep(0.05)
+    assert bench.driver.record.paused
+    assert bench.around.orders.empty()
+
+
+async def test_a_task_without_the_robot_is_left_alone(bench: Any) -> None:
+    """A stop of another robot means nothing for it."""
+    bench.around.commands = stopping = Stopping()
+    stopping.active = (SoftStop(id="st-1", robots=("r9",), by="ann"),)
+    await bench.start()
+    await bench.ordered()
+    assert not bench.driver.record.pauses
+
+
+async def test_a_lease_ends_the_run_and_the_subtask_waits(bench: Any) -> None:
+    """The task is not paused; its run on that robot is left for later."""
+    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.around.commands = stopping = Stopping()
+    await bench.start()
+    await bench.ordered()
+    stopping.lease = "taken over by ann"
+    bench.around.robot = (None, "waits for r1: taken over by ann")
+    bench.say(Wake())
+    record = await bench.until(lambda record: record.of("s1").state is SubtaskState.READY)
+    assert not record.pauses
+    assert "taken over by ann" in record.of("s1").note
+    stopping.lease, bench.around.robot = "", ("r1", "")
+    bench.say(Wake())
+    _, request = await bench.ordered()
+    assert request.attempt == 2
+
+
+async def test_a_subtask_that_runs_is_tried_again_on_request(bench: Any) -> None:
+    """Its run is left, the next attempt begins; what has succeeded is kept, and what there is not is told."""
+    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
+    await bench.start()
+    _, request = await bench.ordered()
+    bench.tell(request, RunEventKind.SUCCEEDED, result={"n": 1})
+    _, request = await bench.ordered()
+    with pytest.raises(RefusedError, match="has succeeded"):
+        await bench.order(RetryAsk(id="t-1", subtask="s1"))
+    with pytest.raises(NotFoundError, match="has no subtask 's9'"):
+        await bench.order(RetryAsk(id="t-1", subtask="s9"))
+    with pytest.raises(RefusedError, match="nothing to try again"):
+        await bench.order(RetryAsk(id="t-1"))
+    await bench.order(RetryAsk(id="t-1", subtask="s2", by="ann", act="r"))
+    _, request = await bench.ordered()
+    assert (request.subtask, request.attempt) == ("s2", 2)
+    assert bench.driver.record.retried_by.by == "ann"
+    assert same(fold(bench), bench.driver.told)
+
+
+async def test_a_failed_task_is_tried_again(bench: Any) -> None:
+    """Attempts count on, the skill's retries count anew, what has succeeded is kept; the whole replays the same."""
+    bench.around.skills = {"work": replace(bench.around.skills["work"], retries=0)}
+    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
+    await bench.start()
+    _, request = await bench.ordered()
+    bench.tell(request, RunEventKind.SUCCEEDED, result={"n": 1})
+    _, request = await bench.ordered()
+    bench.tell(request, RunEventKind.FAILED, failure=Failure(code="handler", message="no", retryable=False))
+    ended = await bench.end()
+    assert ended.state is TaskState.FAILED
+    before = ended.of("s2").attempt
+    stored = bench.plane.dht.records["task/t-1"]
+    keeper = Keeper(bench.plane, ended, stored.version, lambda _: None)
+    fields = revived(ended, RetryAsk(id="t-1", by="ann", act="r"), elapsed_s=ended.elapsed_s)
+    assert fields is not None
+    keeper.apply(keeper.transition(machine.TransitionKind.RETRIED, **fields))
+    await keeper.flush()
+    record = keeper.record
+    assert record.state is TaskState.RUNNING
+    assert record.of("s1").state is SubtaskState.SUCCEEDED
+    assert (record.of("s2").state, record.failure, record.retries) == (SubtaskState.READY, None, 1)
+    assert not machine.gives_up(record.of("s2"), Failure(code="handler", message="x", retryable=True), retries=1)
+    assert revived(record, RetryAsk(id="t-1", by="ann", act="r"), elapsed_s=0.0) is None
+    await bench.start(record)
+    _, request = await bench.ordered()
+    assert (request.subtask, request.attempt) == ("s2", before + 1)
+    bench.tell(request, RunEventKind.SUCCEEDED, result={})
+    ended = await bench.end()
+    assert ended.state is TaskState.SUCCEEDED
+    assert same(fold(bench), ended)
+
+
+async def test_orders_that_come_while_it_is_planned_are_looked_at_afterwards(bench: Any) -> None:
+    """A pause given before there is a plan holds its first subtask."""
+    bench.around.planning = asyncio.Event()
+    await bench.start()
+    pausing = asyncio.create_task(bench.order(PauseAsk(id="t-1", by="ann")))
+    await asyncio.sleep(0.02)
+    bench.around.planning.set()
+    assert (await pausing).pauses
+    await asyncio.sleep(0.05)
+    # The plan may have been begun in the same breath as the pause was read: nothing is started after it.
+    started = bench.around.orders.qsize()
+    await asyncio.sleep(0.05)
+    assert bench.around.orders.qsize() == started
+
+
+async def test_an_order_that_a_driver_cannot_take_any_more_is_refused(bench: Any) -> None:
+    """Whoever waits hears that it was not written, and asks again."""
+    await bench.start()
+    await bench.ordered()
+    stored = bench.plane.dht.records["task/t-1"]
+    bench.plane.dht.records["task/t-1"] = type(stored)(
+        key=stored.key, value=encode(bench.driver.record), version={"gw-2": 9}
+    )
+    with pytest.raises(SwiftbotError, match="moved on"):
+        await bench.order(PauseAsk(id="t-1", by="ann"))
+
+
+async def test_a_robot_that_is_taken_at_the_vehicle_is_waited_for(bench: Any) -> None:
+    """A pilot's takeover ends the run, counts for no failure, and the next attempt follows when it is given back."""
+    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
+    await bench.start()
+    _, request = await bench.ordered()
+    bench.tell(request, RunEventKind.STARTED)
+    bench.around.robot = (None, "waits for r1: taken at the vehicle: its mode was changed")
+    taken = Failure(code="taken", message="r1 was taken over during goto: its mode was changed from AUTO to LOITER")
+    bench.tell(request, RunEventKind.FAILED, failure=taken)
+    record = await bench.until(lambda record: record.of("s1").state is SubtaskState.READY)
+    assert record.state is TaskState.RUNNING
+    assert record.of("s1").failure is None
+    assert "from AUTO to LOITER" in record.of("s1").attempts[0].left
+    bench.around.robot = ("r1", "")
+    bench.say(Wake())
+    _, request = await bench.ordered()
+    assert request.attempt == 2
+    assert same(fold(bench), bench.driver.told)
