@@ -11,6 +11,8 @@ Requests refuse unknown fields, so that a typing error is an error and not a sil
 
 from msgspec import Struct
 
+from appliance.model import Signed
+
 
 class Hinted(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to a `PoolHint`: `taken` is False where it cannot be followed, `why` says so."""
@@ -19,7 +21,7 @@ class Hinted(Struct, frozen=True, kw_only=True, omit_defaults=True):
     why: str = ""
 
 
-class WarmAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class WarmAsk(Signed, frozen=True, kw_only=True):
     """`pool_warm`: have `count` containers of an image ready besides those that work, for `keep_s` seconds.
 
     `wait_s`: how long the answer may wait for those that are started; 0 answers at once.
@@ -40,7 +42,7 @@ class Warmed(Struct, frozen=True, kw_only=True, omit_defaults=True):
     problem: str = ""
 
 
-class EvictAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class EvictAsk(Signed, frozen=True, kw_only=True):
     """`pool_evict`: one container by its id, or all idle ones of an image; one of the two is named."""
 
     container: str = ""
@@ -56,7 +58,7 @@ class Evicted(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What follows: the floor is filled again."""
 
 
-class ReleaseAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ReleaseAsk(Signed, frozen=True, kw_only=True):
     """`pool_release_quarantine`: which image may be started again."""
 
     image: str

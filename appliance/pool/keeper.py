@@ -27,6 +27,7 @@ from appliance.pool.experience import Experience
 from appliance.pool.glance import glance
 from appliance.pool.link import EngineLink
 from appliance.pool.policies import Planner, Retire, View
+from appliance.pool.policies.planner import Weighed
 from appliance.pool.pressure import MemoryWatch, Reading
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
@@ -59,6 +60,7 @@ class Keeper:
         on_change: told the facts of all containers after something changed.
         refused: counts what is declined.
         read_memory: what the kernel says of memory, unless a test says otherwise.
+        on_evicted: told whom a run's container takes the place of, and what was weighed.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class Keeper:
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         refused: Counter[str],
         read_memory: Callable[[], Reading] | None = None,
+        on_evicted: Callable[[Weighed], None] = lambda _: None,
     ) -> None:
         self.decisions = Decisions()
         self.books = Books(config, begin=self._begin, on_change=on_change, refused=refused)
@@ -82,6 +85,7 @@ class Keeper:
         self._gateway = gateway
         self._images = tuple(images)
         self._refused = refused
+        self._on_evicted = on_evicted
         self._wake = asyncio.Event()
         self._starter = make_starter(lambda container: self.retire(container, "it died"))
         self.starts = Starts(
@@ -330,6 +334,8 @@ class Keeper:
         if victims is None:
             return None
         self._check_image(need.image)
+        if victims and self._planner.weighed is not None:
+            self._on_evicted(self._planner.weighed)
         self._make_room(victims, view)
         container = self._start(need.image, need, "a run waits for it")
         container.reservation = FOR_A_RUN

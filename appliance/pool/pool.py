@@ -19,14 +19,17 @@ from typing import Any
 
 import msgspec
 import structlog
+from msgspec import Struct
 
 from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, Need, Phase, RunEvent, RunRequest, Site, Way
 from appliance.pool.container import PooledContainer
 from appliance.pool.conversation import Call
+from appliance.pool.decided import eviction_case, selection_case, watched
 from appliance.pool.engine import Engine, PodmanEngine
 from appliance.pool.experience import Keepsake, Store
 from appliance.pool.keeper import Keeper
+from appliance.pool.policies.planner import Weighed
 from appliance.pool.pressure import Reading
 from appliance.pool.running import Runs
 from appliance.pool.selection import Candidate, Decision, Facts, select
@@ -58,6 +61,7 @@ class Pool:
         on_change: told the facts of all containers whenever one of them changes.
         state: where state volumes and images of other gateways come from.
         store: keeps what the pool learns over a restart; None: it begins anew each time.
+        on_decided: told each selection and eviction with what it rested on (`decided`), if the settings say so.
         make_engine: Podman, unless a test says otherwise.
         read_memory: what the kernel says of memory, unless a test says otherwise.
 
@@ -80,6 +84,7 @@ class Pool:
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         state: State = ALONE,
         store: Store | None = None,
+        on_decided: Callable[[Struct, str], None] = lambda _case, _what: None,
         make_engine: Callable[[], Engine] | None = None,
         read_memory: Callable[[], Reading] | None = None,
     ) -> None:
@@ -93,6 +98,7 @@ class Pool:
         self._catalogue = catalogue
         self._find_remote = find_remote
         self._facts = facts
+        self._on_decided = on_decided
 
         def make_starter(on_death: Callable[[PooledContainer], None]) -> Starter:
             return Starter(
@@ -115,6 +121,7 @@ class Pool:
             on_change=on_change,
             refused=self.refused,
             read_memory=read_memory,
+            on_evicted=self._evicted,
         )
         self._keepsake = Keepsake(store, recall=self._keeper.recall, tell=self._keeper.experience)
         self._runs = Runs(
@@ -202,18 +209,19 @@ class Pool:
             PoolError: no container is ready and none can be started.
         """
         self._check(need)
-        facts = msgspec.structs.replace(self._facts(need), inputs=inputs or {}, avoid=avoid or {})
-        decision = self._choose(need, [], facts)
+        facts = watched(msgspec.structs.replace(self._facts(need), inputs=inputs or {}, avoid=avoid or {}))
+        offers: list[Candidate] = []
+        decision = self._choose(need, offers, facts)
         wanting = decision.phase is Phase.COLD or decision.way is Way.BRING_HERE
         if wanting and allow_remote and self._config.mode == "federated":
             # Not held while others are asked: a container that another run could use must not wait for that.
-            offers: list[Candidate] = []
             try:
                 async with asyncio.timeout(self._config.remote_timeout_s):
                     offers = await self._find_remote(need)
             except (TimeoutError, SwiftbotError) as error:
                 log.info("other gateways could not be asked", reason=str(error) or "too slow")
             decision = self._choose(need, offers, facts)
+        self._tell(decision, need, offers, facts)
         if decision.phase is Phase.COLD:
             self._keeper.check_startable(need, turn)
         elif decision.phase is Phase.LOCAL_WARM and decision.container is not None:
@@ -223,6 +231,26 @@ class Pool:
     def _choose(self, need: Need, offers: list[Candidate], facts: Facts) -> Decision:
         cold_ms = self.cold_ms(need.image)
         return select(need, self.containers(), offers, cold_ms, self._config, gateway=self.gateway, facts=facts)
+
+    def _tell(self, decision: Decision, need: Need, offers: list[Candidate], facts: Facts) -> None:
+        """Tell a decision with what it rested on; nothing has changed since it was made."""
+        if not self._config.tell_decisions:
+            return
+        case = selection_case(
+            decision,
+            need=need,
+            local=self.containers(),
+            remote=offers,
+            cold_ms=self.cold_ms(need.image),
+            config=self._config,
+            gateway=self.gateway,
+            facts=facts,
+        )
+        self._on_decided(case, "selection")
+
+    def _evicted(self, weighed: Weighed) -> None:
+        if self._config.tell_decisions:
+            self._on_decided(eviction_case(weighed, gateway=self.gateway), "eviction")
 
     def _check(self, need: Need) -> None:
         if need.image not in self._catalogue.images:

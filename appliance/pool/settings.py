@@ -54,6 +54,9 @@ PAPER_IDLE_S = 600.0
 class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of one gateway's pool."""
 
+    tell_decisions: bool = True
+    """Put each selection and eviction with all that it rested on, so that `swiftbot log check` can make it again: about
+    1 kB a run."""
     mode: Literal["cold", "local", "federated"] = "federated"
     """`cold`: a fresh container for every run, removed afterwards (the baseline to measure against). `local`: warm
     containers of this gateway only, as in the paper: kept for ten minutes after their last run, the longest idle one

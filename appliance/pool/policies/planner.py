@@ -52,6 +52,16 @@ class PlannerState(Struct, frozen=True, kw_only=True):
     demand: dict[str, DemandState] = {}
 
 
+class Weighed(Struct, frozen=True):
+    """Whom `room` gave up for a run, and what it weighed."""
+
+    idle: tuple[Idle, ...]
+    worths: tuple[float, ...]
+    slots: int
+    memory_mb: int
+    chosen: tuple[Idle, ...]
+
+
 class Planner:
     """Prewarming, keeping and eviction of one gateway's containers.
 
@@ -102,6 +112,8 @@ class Planner:
             "learned": self._learned,
         }
         self._evictor = evictor or policies[settings.eviction]
+        self.weighed: Weighed | None = None
+        """What the last room for a run was made from, where it took the place of something."""
 
     # --- what happens ---------------------------------------------------------------------------------------
 
@@ -152,6 +164,7 @@ class Planner:
         worths = self._evictor.worths(view.idle, now)
         if for_run:
             chosen = victims(view.idle, worths, slots=slots, memory_mb=needed_mb, spare={})
+            self.weighed = Weighed(view.idle, tuple(worths), slots, needed_mb, chosen or ())
         else:
             chosen = self._cheaper(view, worths, slots, needed_mb, self._wanted(view, now), now)
         return None if chosen is None else tuple(Retire(id=each.id, why="its place is needed") for each in chosen)

@@ -6,6 +6,7 @@ part of the effect's identity, so a handler that makes the same calls again in a
 """
 
 import mmap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -98,6 +99,14 @@ class Context(Surroundings):
     def notify(self, to: str, text: str) -> dict[str, Any]:
         """Send a message to a person."""
         return self._dict(self._link.ask("notify", {"to": to, "text": text}))
+
+    def ask(self, question: str, choices: Sequence[str] = (), to: str = "operator", timeout_s: float = 240) -> str:
+        """Ask people and return the answer, one of `choices` where there are any; the first answer counts.
+
+        Raises Fail when nobody answers within `timeout_s`.
+        """
+        args = {"question": question, "choices": list(choices), "to": to, "timeout_s": timeout_s}
+        return str(self._dict(self._link.ask("ask", args)).get("answer", ""))
 
     def put_artifact(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> dict[str, Any]:
         """Keep a file and return a reference to it, fit for a result. At most 11 MiB."""

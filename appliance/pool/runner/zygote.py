@@ -93,6 +93,9 @@ class Zygote:
                     self._run.end(3, ORPHAN_GRACE_S)
                 elif fd in self._connections:
                     self._read(self._connections[fd])
+            if self._stopping and self._run is not None:
+                # Told to stop while an order was on its way to its child: the signal found no run to end.
+                self._run.end(4, GRACE_S)
             self._watch()
             self._reap()
         if self._ahead is not None:
