@@ -1,38 +1,45 @@
-"""The terminal UI's line to the fleet: hears what is put, asks the gateways, connects again when it breaks.
+"""The terminal UI's line to the fleet: hears what is put, carries orders, connects again when the line breaks.
 
-It knows nothing of Textual. It never raises for the network's sake while it listens: `snapshot().connection` says
-what is wrong and what to do. Questions (`plan`, `submit`, `cancel`) raise `SwiftbotError`.
+It knows nothing of Textual. It never raises for the network's sake while it listens: `store.connection` says what is
+wrong, since when, and what to do. `orders` raises `SwiftbotError`.
 """
 
 import asyncio
 import contextlib
 import time
 from collections.abc import MutableMapping
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol
 
 import structlog
-from msgspec import Struct
 
+from appliance.client import Endpoint, FleetClient
+from appliance.connection import operator_name
 from appliance.errors import SwiftbotError, UnreachableError
-from appliance.model import LogLine, Notice, Plan, RunEvent, TaskRecord, TaskRequest
-from appliance.plane.node import PlaneClient
+from appliance.model import TaskRecord
+from appliance.plane.node import Member, MemberAsk, PlaneClient
 from appliance.plane.session import Closer
 from appliance.plane.settings import PlaneConfig
-from appliance.record.facts import RecorderStatus
-from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
-from appliance.tui.board import SILENT, Board, Connection, Snapshot
+from appliance.tui.hearing import Hearing
 from appliance.tui.settings import TuiConfig
+from appliance.tui.store import Connection, Store
 
 log = structlog.get_logger(__name__)
 
-R = TypeVar("R", bound=Struct)
 _WATCH_S = 0.5
+_PING_TIMEOUT_S = 1.0
+_PINGS = 10
+"""Gateways whose latency is measured a second at most."""
 
 
 class View(Protocol):
-    """What the screens need: the seam at which tests put a fleet of their own."""
+    """What the screens need: the seam at which tests, and recorded logs, put a fleet of their own."""
 
     fleet: str
+    store: Store
+    operator: str
+    """Who gives the orders, for the audit."""
+    steerable: bool
+    """False where nothing can be ordered, as in a recorded log."""
 
     async def start(self) -> None:
         """Begin to listen, and keep connected; returns at once."""
@@ -42,25 +49,13 @@ class View(Protocol):
         """End listening."""
         ...
 
+    def sync(self) -> None:
+        """Bring the store up to date; called before each drawing."""
+        ...
+
     @property
-    def revision(self) -> int:
-        """Rises when `snapshot` would show something new."""
-        ...
-
-    def snapshot(self) -> Snapshot:
-        """Return the fleet as it is known just now."""
-        ...
-
-    async def plan(self, instruction: str) -> PlanAnswer:
-        """Ask for a plan; nothing is run."""
-        ...
-
-    async def submit(self, instruction: str, *, plan: Plan, task_id: str) -> TaskRecord:
-        """Submit that plan; the same `task_id` again is the same task."""
-        ...
-
-    async def cancel(self, task_id: str) -> TaskRecord:
-        """Ask for a task to stop."""
+    def orders(self) -> FleetClient:
+        """What carries orders; UnreachableError while there is no connection."""
         ...
 
 
@@ -73,16 +68,19 @@ class FleetView:
         config: Bounds and times.
     """
 
+    steerable = True
+
     def __init__(self, plane_config: PlaneConfig, fleet: str, config: TuiConfig | None = None) -> None:
         self.fleet = fleet
         self.config = config or TuiConfig()
-        self.board = Board(tasks=self.config.tasks, entries=self.config.entries)
+        self.operator = operator_name()
+        self.store = Store(tasks=self.config.tasks, entries=self.config.entries)
+        self._hearing = Hearing(self.store, fleet)
         self._plane_config = plane_config
-        self._client: PlaneClient | None = None
-        self._connection = Connection(problem="connecting", remedy="one moment")
+        self._client: FleetClient | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._closers: list[Closer] = []
-        self._changes = 0
+        self._dirty: set[str] = set()
 
     async def start(self) -> None:
         """Begin to listen, and keep connected."""
@@ -97,61 +95,31 @@ class FleetView:
             self._keeper = None
 
     @property
-    def revision(self) -> int:
-        """Rises with every change."""
-        return self.board.revision + self._changes
-
-    def snapshot(self) -> Snapshot:
-        """Return the fleet as it is known just now."""
-        client = self._client
-        if client is None:
-            return Snapshot(
-                fleet=self.fleet, connection=self._connection, tasks=self.board.tasks, entries=self.board.entries
-            )
-        registry = client.registry
-        return Snapshot(
-            fleet=self.fleet,
-            connection=self._connection,
-            gateways=tuple(registry.gateways[name] for name in sorted(registry.gateways)),
-            containers=tuple(held[name] for _, held in sorted(registry.containers.items()) for name in sorted(held)),
-            robots=tuple(registry.robots[name] for name in sorted(registry.robots)),
-            tasks=self.board.tasks,
-            entries=self.board.entries,
-            recorders=self.board.recorders(time.monotonic()),
-        )
-
-    async def plan(self, instruction: str) -> PlanAnswer:
-        """Ask any gateway for a plan."""
-        return await self._ask("plan", PlanAsk(instruction=instruction), PlanAnswer, self.config.plan_timeout_s)
-
-    async def submit(self, instruction: str, *, plan: Plan, task_id: str) -> TaskRecord:
-        """Submit that plan; durable when this returns."""
-        request = TaskRequest(instruction=instruction, id=task_id, submitter="tui", plan=plan)
-        record = await self._ask("submit", request, TaskRecord, self.config.call_timeout_s)
-        self.board.take_task(record)
-        return record
-
-    async def cancel(self, task_id: str) -> TaskRecord:
-        """Ask for a task to stop."""
-        record = await self._ask("cancel", TaskAsk(id=task_id), TaskRecord, self.config.call_timeout_s)
-        self.board.take_task(record)
-        return record
-
-    async def _ask(self, verb: str, request: Struct, reply: type[R], timeout_s: float) -> R:
-        client = self._client
-        if client is None:
+    def orders(self) -> FleetClient:
+        """What carries orders; UnreachableError while there is no connection."""
+        if self._client is None:
+            connection = self.store.connection
             raise UnreachableError(
-                f"not connected: {self._connection.problem}", remedy=self._connection.remedy or "wait, then try again"
+                f"not connected: {connection.problem}", remedy=connection.remedy or "wait, then try again"
             )
-        gateway = await client.any_gateway()
-        return await client.rpc.call(gateway, verb, request, reply, timeout_s=timeout_s)
+        return self._client
 
-    def take_own_log(self, _logger: Any, method: str, event: MutableMapping[str, Any]) -> NoReturn:
-        """Take a log line of this process (a structlog processor): the terminal belongs to the screen."""
-        fields = " ".join(f"{key}={value}" for key, value in event.items() if key not in ("event", "level"))
-        text = f"{event.get('event', '')} {fields}"
-        self.board.add(time.time_ns(), kind="log", level=method, source="tui", text=text)
-        raise structlog.DropEvent
+    def sync(self) -> None:
+        """Take from the registry what has changed there."""
+        if self._client is None or not self._dirty:
+            return
+        registry, dirty = self._client.plane.registry, self._dirty
+        self._dirty = set()
+        if "gateway" in dirty:
+            self.store.take_gateways(registry.gateways, time.time_ns())
+        if "container" in dirty:
+            self.store.take_containers(registry.containers)
+        if "robot" in dirty:
+            self.store.take_robots(registry.robots)
+
+    def take_own_log(self, logger: Any, method: str, event: MutableMapping[str, Any]) -> NoReturn:
+        """Take a log line of this process (a structlog processor)."""
+        take_own_log(self.store, logger, method, event)
 
     # --- keeping connected -------------------------------------------------------------------------------
 
@@ -160,107 +128,126 @@ class FleetView:
             try:
                 await self._keep_once()
             except SwiftbotError as error:
-                self._tell(Connection(problem=error.message, remedy=error.remedy or self._remedy()))
+                self.store.tell(Connection(problem=error.message, remedy=error.remedy or self._remedy()))
             except Exception as error:  # supervision boundary: the view must say that it no longer hears anything
                 log.exception("the view of the fleet failed")
-                self._tell(Connection(problem=f"internal error: {error!r}", remedy="trying again; see the log screen"))
+                self.store.tell(Connection(problem=f"internal error: {error!r}", remedy="trying again; see the log"))
             await asyncio.sleep(self.config.reconnect_s)
 
     async def _keep_once(self) -> None:
         """One connection from its opening to its end."""
-        client = await PlaneClient.open(self._plane_config, fleet=self.fleet)
+        endpoint = Endpoint(fleet=self.fleet, connect=self._plane_config.connect)
+        client = FleetClient(endpoint, operator=self.operator, plane=self._plane_config)
+        await client.open()
         try:
-            self._listen(client)
+            self._listen(client.plane)
             self._client = client
-            await self._watch(client)
+            self._dirty |= {"gateway", "container", "robot"}
+            pinging = asyncio.create_task(self._keep_pinging(client.plane), name="latencies")
+            try:
+                await self._watch(client.plane)
+            finally:
+                pinging.cancel()
         finally:
             self._client = None
+            self.store.take_gateways({}, time.time_ns())
             await client.close()
 
-    def _listen(self, client: PlaneClient) -> None:
-        keys, session = client.keys, client.session
-        self._closers = [  # they end with the session; kept because a token or subscription may end with its handle
-            session.subscribe_typed(keys.task(), TaskRecord, self._on_task),
-            session.subscribe_typed(keys.run(), RunEvent, self._on_run),
-            session.subscribe_typed(keys.notice(), Notice, self._on_notice),
-            session.subscribe_typed(keys.log(), LogLine, self._on_log),
-            session.subscribe_typed(keys.recorder_status(), RecorderStatus, self._on_recorder),
+    def _listen(self, plane: PlaneClient) -> None:
+        # They end with the session; kept because a subscription may end with its handle.
+        self._closers = [
+            plane.session.subscribe_typed(door.expr, door.kind, door.take) for door in self._hearing.events
         ]
-        client.registry.on_change.append(self._on_registry)
+        plane.registry.on_change.append(self._dirty_now)
 
-    async def _watch(self, client: PlaneClient) -> None:
+    def _dirty_now(self, what: str) -> None:
+        self._dirty.add(what)
+
+    async def _watch(self, plane: PlaneClient) -> None:
         """Watch over one connection; returns when it is to be made anew."""
         silent_since = time.monotonic()
         asked_at = float("-inf")
-        silent: set[str] = set()
         members: frozenset[str] = frozenset()
         while True:
             now = time.monotonic()
-            fell_silent = {status.id for status in self.board.recorders(now) if status.state == SILENT}
-            if fell_silent != silent:  # nothing was heard, so nothing else would have it drawn
-                silent = fell_silent
-                self._changes += 1
-            if client.members() != members:
+            self.store.listen_for_silence(now)
+            if plane.members() != members:
                 # Gateways came or went, perhaps the one that this connection hung on: pushes may have been missed.
-                members = client.members()
+                members = plane.members()
                 asked_at = float("-inf")
+                self._take_arcs(plane)
             if members:
                 silent_since = now
-                self._tell(Connection(connected=True))
+                self.store.tell(Connection(connected=True))
                 if now - asked_at >= self.config.resync_s:
                     asked_at = now
                     await self._resync()
             else:
                 where = ", ".join(self._plane_config.connect) or "this network"
-                self._tell(Connection(problem=f"no gateway of fleet {self.fleet} at {where}", remedy=self._remedy()))
+                problem = f"no gateway of fleet {self.fleet} at {where}"
+                self.store.tell(Connection(problem=problem, remedy=self._remedy()))
                 if now - silent_since >= self.config.silence_s:
                     return
             await asyncio.sleep(_WATCH_S)
 
     async def _resync(self) -> None:
         try:
-            ask = TasksAsk(limit=min(100, self.config.tasks))
-            answer = await self._ask("tasks", ask, TaskList, self.config.call_timeout_s)
+            answer = await self.orders.tasks(min(100, self.config.tasks))
         except SwiftbotError as error:
             # The pushes still come; the next round asks again, of another gateway if this one is gone.
-            self.board.add(time.time_ns(), kind="log", level="warning", source="tui", text=f"task list: {error}")
+            self._say(f"task list: {error}")
             return
-        self.board.take_tasks(answer.tasks)
+        self.store.take_tasks(answer.tasks)
+        await self._ask_standing()
         if answer.unreachable:
-            text = f"task list is without {', '.join(answer.unreachable)}: no answer"
-            self.board.add(time.time_ns(), kind="log", level="warning", source="tui", text=text)
+            self._say(f"task list is without {', '.join(answer.unreachable)}: no answer")
 
-    def _tell(self, connection: Connection) -> None:
-        if connection != self._connection:
-            self._connection = connection
-            self._changes += 1
+    async def _ask_standing(self) -> None:
+        """Ask for soft stops, and the questions that wait; others were answered or closed unheard."""
+        try:
+            answer = await self.orders.enquiries()
+            standing = await self.orders.standing()
+        except SwiftbotError as error:
+            self._say(f"what waits for operators: {error}")
+            return
+        self.store.take_stops(standing.stops, standing.lifted)
+        waiting = {each.id for each in answer.enquiries}
+        for name in [name for name, each in self.store.enquiries.items() if each.open and name not in waiting]:
+            self.store.enquiries.drop(name)
+        for each in answer.enquiries:
+            self.store.enquiries.put(each.id, each)
+
+    def _say(self, text: str) -> None:
+        self.store.add(time.time_ns(), kind="log", level="warning", source="tui", text=text)
+
+    def note(self, record: TaskRecord) -> None:
+        """Take a record that an order was answered with, which is heard a moment later anyway."""
+        self.store.take_task(record)
 
     def _remedy(self) -> str:
         return "start one with `swiftbot up` or name its endpoint with --connect; trying again by itself"
 
-    # --- what is heard -----------------------------------------------------------------------------------
+    # --- what is measured from here ------------------------------------------------------------------------
 
-    def _on_task(self, key: str, record: TaskRecord | None) -> None:
-        if record is None:
-            self.board.forget_task(key.split("/")[-2])
-        else:
-            self.board.take_task(record)
+    def _take_arcs(self, plane: PlaneClient) -> None:
+        self.sync()
+        for name, share in plane.ring.shares().items():
+            self.store.measured(name, arc=share)
 
-    def _on_run(self, _key: str, event: RunEvent | None) -> None:
-        if event is not None:
-            self.board.take_run(event, time.time_ns())
+    async def _keep_pinging(self, plane: PlaneClient) -> None:
+        """Measure how long a question to each gateway takes, one after the other."""
+        while True:
+            for name in sorted(plane.members()):
+                began = time.monotonic()
+                with contextlib.suppress(SwiftbotError):
+                    await plane.rpc.call(name, "member", MemberAsk(gateway=name), Member, timeout_s=_PING_TIMEOUT_S)
+                    self.store.measured(name, latency_ms=1e3 * (time.monotonic() - began))
+                await asyncio.sleep(1 / _PINGS)
+            await asyncio.sleep(self.config.ping_s)
 
-    def _on_notice(self, _key: str, notice: Notice | None) -> None:
-        if notice is not None:
-            self.board.take_notice(notice)
 
-    def _on_log(self, _key: str, line: LogLine | None) -> None:
-        if line is not None:
-            self.board.take_log(line)
-
-    def _on_recorder(self, _key: str, status: RecorderStatus | None) -> None:
-        if status is not None:
-            self.board.take_recorder(status, time.monotonic())
-
-    def _on_registry(self, _what: str) -> None:
-        self._changes += 1
+def take_own_log(store: Store, _logger: Any, method: str, event: MutableMapping[str, Any]) -> NoReturn:
+    """Take a log line of this process (a structlog processor): the terminal belongs to the screen."""
+    fields = " ".join(f"{key}={value}" for key, value in event.items() if key not in ("event", "level"))
+    store.add(time.time_ns(), kind="log", level=method, source="tui", text=f"{event.get('event', '')} {fields}")
+    raise structlog.DropEvent

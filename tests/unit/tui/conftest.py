@@ -1,5 +1,8 @@
 """A small fleet and a view of it that needs no network: the fake at the terminal UI's one seam."""
 
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from typing import cast
+
 import pytest
 
 from appliance.errors import SwiftbotError
@@ -10,19 +13,23 @@ from appliance.model import (
     Failure,
     GatewayStatus,
     Phase,
+    Place,
     Plan,
     Pose,
     RobotInfo,
+    Site,
     Subtask,
     SubtaskRecord,
     SubtaskState,
     TaskRecord,
+    TaskRequest,
     TaskState,
     Tier,
 )
-from appliance.record.facts import RecorderStatus
 from appliance.tasks.api import PlanAnswer
-from appliance.tui.board import Board, Connection, Snapshot
+from appliance.tasks.watch.lines import Line
+from appliance.tasks.why import TaskWhy, why
+from appliance.tui.store import Connection, Store
 
 PLAN = Plan(
     domain="inspection",
@@ -81,66 +88,143 @@ RUNNING = TaskRecord(
 DONE = TaskRecord(id="t-done", instruction="greet", state=TaskState.SUCCEEDED, created_ns=1, sequence=9)
 
 
+GATEWAYS = (
+    GatewayStatus(
+        id="gw-a",
+        fleet="test",
+        version="0.1.0",
+        load=0.42,
+        cpu_percent=12.0,
+        memory_mb=120.0,
+        containers=4,
+        ready=3,
+        running=1,
+        tasks=1,
+        robots=("drone-1",),
+        models=("local:tiny", "rules"),
+    ),
+    GatewayStatus(
+        id="gw-b",
+        fleet="test",
+        limits_enforced=False,
+        pool_problem="podman.socket is absent",
+        refused={"payload": 2},
+    ),
+)
+CONTAINERS = (
+    ContainerInfo(
+        id="c1",
+        gateway="gw-a",
+        image="localhost/swiftbot/base:1",
+        state=ContainerState.BUSY,
+        run="t-running/s1/1",
+        cold_ms=812.0,
+        runs=3,
+    ),
+    ContainerInfo(id="c2", gateway="gw-a", image="localhost/swiftbot/vision:1", state=ContainerState.READY),
+)
+ROBOTS = (
+    RobotInfo(
+        id="drone-1",
+        kind="mavlink",
+        gateway="gw-a",
+        mode="GUIDED",
+        armed=True,
+        battery_percent=81.0,
+        pose=Pose(x=1.0, y=2.0, z=10.0),
+    ),
+    RobotInfo(id="rover-1", kind="zenoh", online=False, note="no heartbeat for 3 s"),
+)
+
+
+SITE = Site(places={"gate": Place(x=5.0, y=8.0), "cold store": Place(x=-4.0, y=2.0, aliases=("freezer",))})
+
+
+class FakeOrders:
+    """A client of a fleet that notes what it is asked, by verb, and answers or raises what a test has set."""
+
+    def __init__(self, store: Store) -> None:
+        self.asked: list[tuple[object, ...]] = []
+        self.error: SwiftbotError | None = None
+        self.options: dict[str, dict[str, object]] = {}
+        """The named arguments of the last call of a verb."""
+        self.answers: dict[str, object] = {"site": SITE, "pool_decisions": ({}, {})}
+        self.lines: list[Line] = []
+        """What runs of any task say."""
+        self._store = store
+
+    def of(self, verb: str) -> list[tuple[object, ...]]:
+        """Return the arguments of all calls of a verb."""
+        return [call[1:] for call in self.asked if call[0] == verb]
+
+    async def plan(self, instruction: str) -> PlanAnswer:
+        """Answer with the plan above."""
+        self._note("plan", instruction)
+        return PlanAnswer(plan=PLAN)
+
+    async def submit(self, request: TaskRequest) -> TaskRecord:
+        """Accept the task."""
+        self._note("submit", request.instruction, request.plan, request.id)
+        record = TaskRecord(id=request.id, instruction=request.instruction, plan=request.plan, created_ns=3)
+        self._store.take_task(record)
+        return record
+
+    async def cancel(self, task: str) -> TaskRecord:
+        """Answer with the task as it is."""
+        self._note("cancel", task)
+        return RUNNING
+
+    async def why(self, task: str, subtask: str = "") -> TaskWhy:
+        """Answer with the reasons of the record, and a wait for what has not begun."""
+        self._note("why", task, subtask)
+        if "why" in self.answers:
+            return cast("TaskWhy", self.answers["why"])
+        return why(self._store.tasks[task])
+
+    async def stream(self, task: str) -> AsyncGenerator[Line]:
+        """Yield what is set, then nothing more."""
+        self._note("stream", task)
+        for line in self.lines:
+            yield line
+
+    async def gateway(self) -> str:
+        """Return any gateway."""
+        return "gw-a"
+
+    def __getattr__(self, verb: str) -> Callable[..., Awaitable[object]]:
+        """Return what notes any other verb and answers what the test has set for it."""
+        if verb.startswith("_"):
+            raise AttributeError(verb)
+
+        async def ask(*arguments: object, **options: object) -> object:
+            self.options[verb] = options
+            self._note(verb, *arguments)
+            return self.answers[verb]
+
+        return ask
+
+    def _note(self, *call: object) -> None:
+        self.asked.append(call)
+        if self.error is not None:
+            raise self.error
+
+
 class FakeView:
-    """A view whose facts a test sets, and which remembers what it was asked."""
+    """A view whose facts a test sets, and whose orders are noted."""
 
     fleet = "test"
+    operator = "ops"
+    steerable = True
 
     def __init__(self) -> None:
-        self.board = Board(tasks=50, entries=100)
-        self.board.take_tasks([RUNNING, DONE])
-        self.gateways = (
-            GatewayStatus(
-                id="gw-a",
-                fleet="test",
-                load=0.42,
-                cpu_percent=12.0,
-                memory_mb=120.0,
-                containers=4,
-                ready=3,
-                running=1,
-                tasks=1,
-                robots=("drone-1",),
-            ),
-            GatewayStatus(
-                id="gw-b",
-                fleet="test",
-                limits_enforced=False,
-                pool_problem="podman.socket is absent",
-                refused={"payload": 2},
-            ),
-        )
-        self.containers = (
-            ContainerInfo(
-                id="c1",
-                gateway="gw-a",
-                image="localhost/swiftbot/base:1",
-                state=ContainerState.BUSY,
-                run="t-running/s1/1",
-                cold_ms=812.0,
-                runs=3,
-            ),
-            ContainerInfo(id="c2", gateway="gw-a", image="localhost/swiftbot/vision:1", state=ContainerState.READY),
-        )
-        self.robots = (
-            RobotInfo(
-                id="drone-1",
-                kind="mavlink",
-                gateway="gw-a",
-                mode="GUIDED",
-                armed=True,
-                battery_percent=81.0,
-                pose=Pose(x=1.0, y=2.0, z=10.0),
-            ),
-            RobotInfo(id="rover-1", kind="zenoh", online=False, note="no heartbeat for 3 s"),
-        )
-        self.connection = Connection(connected=True)
-        self.recorders: tuple[RecorderStatus, ...] = ()
-        self.changes = 0
-        self.error: SwiftbotError | None = None
-        self.planned: list[str] = []
-        self.submitted: list[tuple[str, Plan, str]] = []
-        self.cancelled: list[str] = []
+        self.store = Store(tasks=50, entries=100)
+        self.store.tell(Connection(connected=True))
+        self.store.take_tasks([RUNNING, DONE])
+        self.store.take_gateways({each.id: each for each in GATEWAYS}, 1)
+        self.store.take_robots({each.id: each for each in ROBOTS})
+        self.store.take_containers({"gw-a": {each.id: each for each in CONTAINERS}})
+        self.orders = FakeOrders(self.store)
+        self.synced = 0
         self.started = self.closed = False
 
     async def start(self) -> None:
@@ -151,47 +235,9 @@ class FakeView:
         """Note that it was closed."""
         self.closed = True
 
-    @property
-    def revision(self) -> int:
-        """Rise with the board and with `changes`."""
-        return self.board.revision + self.changes
-
-    def snapshot(self) -> Snapshot:
-        """Return the facts as they are set."""
-        return Snapshot(
-            fleet=self.fleet,
-            connection=self.connection,
-            gateways=self.gateways,
-            containers=self.containers,
-            robots=self.robots,
-            tasks=self.board.tasks,
-            entries=self.board.entries,
-            recorders=self.recorders,
-        )
-
-    def _fail(self) -> None:
-        if self.error is not None:
-            raise self.error
-
-    async def plan(self, instruction: str) -> PlanAnswer:
-        """Answer with the plan above, or the error that is set."""
-        self.planned.append(instruction)
-        self._fail()
-        return PlanAnswer(plan=PLAN)
-
-    async def submit(self, instruction: str, *, plan: Plan, task_id: str) -> TaskRecord:
-        """Accept the task, or raise the error that is set."""
-        self.submitted.append((instruction, plan, task_id))
-        self._fail()
-        record = TaskRecord(id=task_id, instruction=instruction, plan=plan, created_ns=3)
-        self.board.take_task(record)
-        return record
-
-    async def cancel(self, task_id: str) -> TaskRecord:
-        """Note the wish, or raise the error that is set."""
-        self.cancelled.append(task_id)
-        self._fail()
-        return RUNNING
+    def sync(self) -> None:
+        """Count how often it was brought up to date."""
+        self.synced += 1
 
 
 @pytest.fixture

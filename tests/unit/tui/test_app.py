@@ -5,53 +5,51 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import pytest
-from textual.pilot import Pilot
-from textual.widgets import Input
+from msgspec.structs import replace
 
 from appliance.errors import PlanError, RefusedError, UnreachableError
-from appliance.model import GatewayStatus, Notice, TaskRecord, TaskState
+from appliance.model import Notice, TaskRecord, TaskState
 from appliance.record.facts import RecorderStatus
 from appliance.tui.actions import ACTIONS
-from appliance.tui.app import SwiftbotApp, export_picture
-from appliance.tui.board import Connection
-from appliance.tui.dialogs import ConfirmDialog, HelpDialog, SubmitDialog
-from appliance.tui.panes import DiffTable
+from appliance.tui.app import SwiftbotApp
+from appliance.tui.dialogs import ConfirmDialog
+from appliance.tui.grid import Grid
+from appliance.tui.help import HelpDialog
+from appliance.tui.running import export_picture
+from appliance.tui.settings import TuiConfig
+from appliance.tui.store import Connection
+from appliance.tui.tasks.submit import SubmitDialog
+
+from .pictures import characters, settle
 
 if TYPE_CHECKING:
     from .conftest import FakeView
 
 pytestmark = pytest.mark.anyio
 SIZE = (80, 24)
-
-
-def seen(app: SwiftbotApp) -> str:
-    """Return what is on the screen, line by line."""
-    lines = app.screen._compositor.render_strips()
-    return "\n".join("".join(segment.text for segment in strip) for strip in lines)
-
-
-async def settle(app: SwiftbotApp, pilot: Pilot[None]) -> str:
-    """Let everything happen and be drawn; return what is on the screen."""
-    await app.workers.wait_for_complete()
-    await pilot.pause()
-    app.draw(force=True)
-    await pilot.pause()
-    return seen(app)
+UNLOCKED = TuiConfig(write=True)
 
 
 async def test_fleet_is_shown_at_80_by_24(view: "FakeView") -> None:
-    """The first screen has gateways with load and pool, robots, and what is wrong, in whole sentences."""
+    """The first screen has gateways with load and pool, and what is wrong, in whole sentences."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
         text = await settle(app, pilot)
-        for expected in ("gw-a", "42%", "3/4", "drone-1", "GUIDED armed", "81%", "1.0 2.0 10.0", "✘ offline"):
+        for expected in ("gw-a", "42%", "3/4", "test · 2 gw · 2 robots · 1 active", "[R] read-only"):
             assert expected in text
         assert "gw-b: podman.socket is absent" in text
         assert "limits are not enforced" in text
         assert "2 bad inputs refused (payload 2)" in text
-        assert "test · 2 gw · 2 robots · 1 active" in text
-    assert view.started
-    assert view.closed
+
+
+async def test_robots_are_shown_at_80_by_24(view: "FakeView") -> None:
+    """Robots stand with kind, mode, battery, place and whether they are there."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("3")
+        text = await settle(app, pilot)
+        for expected in ("drone-1", "GUIDED armed", "81%", "1.0 2.0 10.0", "✘ offline"):
+            assert expected in text
 
 
 @pytest.mark.parametrize(
@@ -70,8 +68,7 @@ async def test_fleet_is_shown_at_80_by_24(view: "FakeView") -> None:
 )
 async def test_recorder_is_shown(view: "FakeView", status: RecorderStatus, expected: str) -> None:
     """Whether the recorder records, has lost something, or is gone, stands on the first screen."""
-    view.gateways = view.gateways[:1]
-    view.recorders = (status,)
+    view.store.recorders.put(status.id, status)
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
         assert expected in await settle(app, pilot)
@@ -103,9 +100,9 @@ async def test_pool_is_shown(view: "FakeView") -> None:
     """The pool screen has the containers of all gateways with what they run."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
-        await pilot.press("3")
+        await pilot.press("4")
         text = await settle(app, pilot)
-        for expected in ("c1", "base:1", "busy", "812.0 ms", "c2", "vision:1", "ready"):
+        for expected in ("c1", "base:1", "busy", "c2", "vision:1", "ready"):
             assert expected in text
 
 
@@ -113,10 +110,10 @@ async def test_log_grows_and_is_filtered(view: "FakeView") -> None:
     """The log screen adds lines as they come, and shows only those with the filter's text."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
-        await pilot.press("4")
-        view.board.take_notice(Notice(id="n1", to="ops", text="inspection done", at_ns=10**18))
+        await pilot.press("7")
+        view.store.take_notice(Notice(id="n1", to="ops", text="inspection done", at_ns=10**18))
         assert "inspection done" in await settle(app, pilot)
-        view.board.take_notice(Notice(id="n2", to="ops", text="battery low", at_ns=10**18))
+        view.store.take_notice(Notice(id="n2", to="ops", text="battery low", at_ns=10**18))
         text = await settle(app, pilot)
         assert text.count("inspection done") == 1
         assert "battery low" in text
@@ -134,54 +131,56 @@ async def test_rows_are_filtered_per_screen(view: "FakeView") -> None:
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("2", "slash", *"greet", "enter")
         await settle(app, pilot)
-        table = app.query_one("#tasks", DiffTable)
-        assert table.row_count == 1
-        assert app.query_one("#filter", Input).display
-        await pilot.press("3")
+        table = app.screen.query_one("#tasks", Grid)
+        assert list(table.keys) == ["t-done"]
+        assert "greet" in characters(app).split("\n")[-2]
+        await pilot.press("4")
         await settle(app, pilot)
-        assert app.query_one("#containers", DiffTable).row_count == 2
+        assert len(app.screen.query_one("#containers", Grid).keys) == 2
         await pilot.press("2", "escape")
         await settle(app, pilot)
-        assert table.row_count == 2
+        assert len(table.keys) == 2
 
 
 async def test_submit_shows_the_plan_first(view: "FakeView") -> None:
     """Enter plans and shows the plan; only a second Enter runs it, with that very plan, and the task is selected."""
-    app = SwiftbotApp(view)
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("s", *"look", "enter")
         text = await settle(app, pilot)
-        assert view.planned == ["look"]
-        assert view.submitted == []
+        assert view.orders.of("plan") == [("look",)]
+        assert view.orders.of("submit") == []
         assert "inspection: 4 subtasks, 2 at once" in text
         assert "└─▶ s2 goto drone-1" in text
         await pilot.press("enter")
         text = await settle(app, pilot)
-        assert [(instruction, plan.domain) for instruction, plan, _ in view.submitted] == [("look", "inspection")]
-        assert app.pane_name == "tasks"
-        assert app.query_one("#tasks", DiffTable).selected == view.submitted[0][2]
+        assert [(instruction, plan.domain) for instruction, plan, _ in view.orders.of("submit")] == [
+            ("look", "inspection")
+        ]
+        assert app.current_mode == "tasks"
+        assert app.screen.query_one("#tasks", Grid).selected == view.orders.of("submit")[0][2]
 
 
 async def test_editing_withdraws_the_plan(view: "FakeView") -> None:
     """A plan that was shown is not run for an instruction edited since: it is planned anew."""
-    app = SwiftbotApp(view)
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
-        await pilot.press("colon", *"a", "enter")
+        await pilot.press("s", *"a", "enter")
         await settle(app, pilot)
         await pilot.press("b", "enter")
         await settle(app, pilot)
-        assert view.planned == ["a", "ab"]
-        assert view.submitted == []
+        assert view.orders.of("plan") == [("a",), ("ab",)]
+        assert view.orders.of("submit") == []
         await pilot.press("escape")
         await pilot.pause()
         assert not isinstance(app.screen, SubmitDialog)
-        assert view.submitted == []
+        assert view.orders.of("submit") == []
 
 
 async def test_no_plan_is_explained(view: "FakeView") -> None:
     """An instruction without a plan shows every problem and the remedy, and nothing runs."""
-    view.error = PlanError("no valid plan", remedy="name the robot", problems=("s1: no robot 'bob'",))
-    app = SwiftbotApp(view)
+    view.orders.error = PlanError("no valid plan", remedy="name the robot", problems=("s1: no robot 'bob'",))
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("s", *"x", "enter")
         text = await settle(app, pilot)
@@ -189,70 +188,85 @@ async def test_no_plan_is_explained(view: "FakeView") -> None:
             assert expected in text
         await pilot.press("enter")
         await settle(app, pilot)
-        assert view.submitted == []
+        assert view.orders.of("submit") == []
 
 
 async def test_submitting_again_is_the_same_task(view: "FakeView") -> None:
     """After an answer that did not come, Enter submits again under the same task id."""
-    app = SwiftbotApp(view)
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("s", *"x", "enter")
         await settle(app, pilot)
-        view.error = UnreachableError("no gateway answered", remedy="start one")
+        view.orders.error = UnreachableError("no gateway answered", remedy="start one")
         await pilot.press("enter")
         assert "no gateway answered" in await settle(app, pilot)
-        view.error = None
+        view.orders.error = None
         await pilot.press("enter")
         await settle(app, pilot)
-        assert len(view.submitted) == 2
-        assert view.submitted[0][2] == view.submitted[1][2]
+        assert len(view.orders.of("submit")) == 2
+        assert view.orders.of("submit")[0][2] == view.orders.of("submit")[1][2]
 
 
 async def test_empty_instruction_is_refused(view: "FakeView") -> None:
     """Enter on nothing asks for an instruction instead of a plan."""
-    app = SwiftbotApp(view)
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("s", "space", "enter")
         assert "Write an instruction first" in await settle(app, pilot)
-        assert view.planned == []
+        assert view.orders.of("plan") == []
 
 
 async def test_cancel_asks_first(view: "FakeView") -> None:
     """`c` asks; n leaves the task alone, y cancels it."""
-    app = SwiftbotApp(view)
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("2")
         await settle(app, pilot)
         await pilot.press("c")
         await pilot.pause()
         assert isinstance(app.screen, ConfirmDialog)
-        assert "Cancel task t-running?" in seen(app)
+        assert "Cancel task t-running?" in characters(app)
         await pilot.press("n")
         await settle(app, pilot)
-        assert view.cancelled == []
+        assert view.orders.of("cancel") == []
         await pilot.press("c", "y")
         await settle(app, pilot)
-        assert view.cancelled == ["t-running"]
+        assert view.orders.of("cancel") == [("t-running",)]
 
 
-async def test_cancel_of_an_ended_task_and_elsewhere(view: "FakeView") -> None:
-    """An ended task is not cancelled, and on other screens the key does nothing."""
-    app = SwiftbotApp(view)
-    async with app.run_test(size=SIZE, notifications=True) as pilot:
+async def test_cancel_elsewhere_does_nothing(view: "FakeView") -> None:
+    """On other screens the key of an action is none."""
+    app = SwiftbotApp(view, UNLOCKED)
+    async with app.run_test(size=SIZE) as pilot:
         await pilot.press("c")
         await pilot.pause()
         assert not isinstance(app.screen, ConfirmDialog)
-        await pilot.press("2")
+
+
+async def test_read_only_changes_nothing(view: "FakeView") -> None:
+    """Locked, no key and no command changes anything, and it is said how to unlock; unlocked they work."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE, notifications=True) as pilot:
+        await pilot.press("2", "c")
+        text = await settle(app, pilot)
+        assert "`:write` unlocks" in text
+        await pilot.press("s")
+        await pilot.press("colon", *"cancel t-running", "enter")
         await settle(app, pilot)
-        await pilot.press("down", "c")
-        assert "has ended" in await settle(app, pilot)
-        assert not isinstance(app.screen, ConfirmDialog)
+        assert not isinstance(app.screen, ConfirmDialog | SubmitDialog)
+        await pilot.press("colon", *"write", "enter")
+        assert "[W] unlocked" in await settle(app, pilot)
+        await pilot.press("c", "y")
+        await settle(app, pilot)
+        assert view.orders.of("cancel") == [("t-running",)]
+        await pilot.press("R")
+        assert "[R] read-only" in await settle(app, pilot)
 
 
 async def test_refusal_is_shown_with_its_remedy(view: "FakeView") -> None:
     """What a gateway refuses is shown with cause and remedy, and the UI goes on."""
-    view.error = RefusedError("gateway is draining", remedy="ask another")
-    app = SwiftbotApp(view)
+    view.orders.error = RefusedError("gateway is draining", remedy="ask another")
+    app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE, notifications=True) as pilot:
         await pilot.press("2")
         await settle(app, pilot)
@@ -267,33 +281,33 @@ async def test_lost_connection_has_a_banner(view: "FakeView") -> None:
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
         assert "✘" not in (await settle(app, pilot)).split("\n")[1]
-        view.connection = Connection(
-            problem="no gateway of fleet test at tcp/x:1", remedy="start one with `swiftbot up`"
+        view.store.tell(
+            Connection(
+                problem="no gateway of fleet test at tcp/x:1",
+                remedy="start one with `swiftbot up`",
+                since_ns=10**18,
+            )
         )
-        view.changes += 1
         text = await settle(app, pilot)
-        assert "no gateway of fleet test at tcp/x:1 → start one" in text.replace("\n", " ")
-        view.connection = Connection(connected=True)
-        view.changes += 1
+        assert "no gateway of fleet test at tcp/x:1, since " in text
+        assert "→ start one with `swiftbot up`" in " ".join(text.split())
+        view.store.tell(Connection(connected=True))
         assert "no gateway of fleet" not in await settle(app, pilot)
 
 
-async def test_unchanged_rows_are_not_written(view: "FakeView") -> None:
-    """Only the cells that differ are written: one change of a gateway's load is one cell."""
+async def test_unchanged_rows_are_not_drawn(view: "FakeView") -> None:
+    """Only rows whose thing is another are drawn again: one gateway's new load is one line."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
         await settle(app, pilot)
-        table = app.query_one("#gateways", DiffTable)
-        before = table.cells_written
+        grid = app.screen.query_one("#gateways", Grid)
+        before = grid.drawn
         await settle(app, pilot)
-        assert table.cells_written == before
-        first, second = view.gateways
-        view.gateways = (
-            GatewayStatus(**{**{f: getattr(first, f) for f in first.__struct_fields__}, "load": 0.9}),
-            second,
-        )
+        assert grid.drawn == before
+        statuses = {name: each.status for name, each in view.store.gateways.items()}
+        view.store.take_gateways(statuses | {"gw-a": replace(statuses["gw-a"], load=0.9)}, 2)
         assert "90%" in await settle(app, pilot)
-        assert table.cells_written == before + 1
+        assert grid.drawn == before + 1
 
 
 async def test_selection_stays_when_tasks_come(view: "FakeView") -> None:
@@ -302,24 +316,24 @@ async def test_selection_stays_when_tasks_come(view: "FakeView") -> None:
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("2", "down")
         await settle(app, pilot)
-        table = app.query_one("#tasks", DiffTable)
+        table = app.screen.query_one("#tasks", Grid)
         assert table.selected == "t-done"
-        view.board.take_task(TaskRecord(id="t-new", instruction="x", state=TaskState.ACCEPTED, created_ns=9))
+        view.store.take_task(TaskRecord(id="t-new", instruction="x", state=TaskState.ACCEPTED, created_ns=9))
         await settle(app, pilot)
         assert table.selected == "t-done"
-        assert table.row_count == 3
+        assert len(table.keys) == 3
 
 
 async def test_help_lists_every_action(view: "FakeView") -> None:
     """The help shows each action of the one list."""
     app = SwiftbotApp(view)
-    async with app.run_test(size=(100, 40)) as pilot:
+    async with app.run_test(size=(100, 120)) as pilot:
         await pilot.press("question_mark")
         await pilot.pause()
         assert isinstance(app.screen, HelpDialog)
-        text = seen(app)
+        text = characters(app)
         for action in ACTIONS:
-            assert action.help in text
+            assert action.help.split(",")[0][:40] in text
         await pilot.press("escape")
         await pilot.pause()
         assert not isinstance(app.screen, HelpDialog)
@@ -333,7 +347,7 @@ async def test_palette_offers_every_action(view: "FakeView") -> None:
         assert {action.title for action in ACTIONS} <= commands.keys()
         await commands["Pool"].callback()
         await pilot.pause()
-        assert app.pane_name == "pool"
+        assert app.current_mode == "pool"
 
 
 async def test_quit_leaves(view: "FakeView") -> None:
@@ -348,13 +362,13 @@ async def test_quit_leaves(view: "FakeView") -> None:
 
 async def test_markup_in_foreign_text_is_text(view: "FakeView") -> None:
     """Brackets in an instruction or a log line are shown as they are, not taken for markup."""
-    view.board.take_task(TaskRecord(id="t-x", instruction="[red]go[/] [/bad]", created_ns=9))
-    view.board.add(10**18, kind="log", level="info", source="[b]", text="[/nope] done")
+    view.store.take_task(TaskRecord(id="t-x", instruction="[red]go[/] [/bad]", created_ns=9))
+    view.store.add(10**18, kind="log", level="info", source="[b]", text="[/nope] done")
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("2")
         assert "[red]go[/] [/bad]" in await settle(app, pilot)
-        await pilot.press("4")
+        await pilot.press("7")
         assert "[/nope] done" in await settle(app, pilot)
 
 

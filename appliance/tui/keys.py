@@ -1,0 +1,59 @@
+"""Key bindings made from the registry, and what a person's own settings make of them."""
+
+from collections.abc import Mapping
+
+from textual.binding import Binding
+
+from appliance.errors import ConfigError
+from appliance.tui import actions
+from appliance.tui.action import Action
+
+PROMPTS = ("command", "filter")
+"""Actions that open a line to be written; not while something is written (`app.check_action`)."""
+
+
+def bindings(scope: str = "") -> list[Binding]:
+    """Return the bindings of one screen, or of all of them when none is named."""
+    found = actions.of(scope) if scope else actions.everywhere()
+    return [
+        Binding(
+            ",".join(action.keys),
+            f"app.act('{action.name}')",
+            action.title,
+            show=False,  # the frame has a footer of its own
+            id=action.name,
+            # A stop must be reached from dialogs and input fields as well; letters are for writing there.
+            # The prompt is opened before the next key is given to anybody: what is typed ahead belongs into it.
+            priority=action.name in PROMPTS or (action.always and all(len(key) > 1 for key in action.keys)),
+        )
+        for action in found
+        if action.keys
+    ]
+
+
+def keymap(own: Mapping[str, str]) -> dict[str, str]:
+    """Return Textual's keymap for a person's own keys by action.
+
+    Raises:
+        ConfigError: no such action, no key, or two actions of one screen share a key.
+    """
+    for name, keys in own.items():
+        if name not in actions.BY_NAME:
+            raise ConfigError(f"tui.keys: there is no action {name!r}", remedy="`?` and docs/tui.md list them")
+        if not all(part.strip() for part in keys.split(",")):
+            raise ConfigError(f"tui.keys.{name}: {keys!r} names no key", remedy='write keys such as "ctrl+x,f9"')
+    taken: dict[tuple[str, str], str] = {}
+    for action in actions.ACTIONS:
+        for key in keys_of(action, own):
+            for scope in action.screens or ("",):
+                other = taken.setdefault((scope, key), action.name)
+                if other != action.name:
+                    raise ConfigError(f"tui.keys: {key} is both {other} and {action.name}", remedy="change one of them")
+    return {name: ",".join(part.strip() for part in keys.split(",")) for name, keys in own.items()}
+
+
+def keys_of(action: Action, own: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the keys of an action as a person has them."""
+    if action.name in own:
+        return tuple(part.strip() for part in own[action.name].split(","))
+    return action.keys

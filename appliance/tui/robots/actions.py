@@ -1,0 +1,103 @@
+"""What can be done with robots: taking one over, answering what it asks, stopping them and letting them go."""
+
+from appliance.client import FleetClient
+from appliance.tui.action import Action, Given, Parameter
+from appliance.tui.safe import safe
+
+
+async def answer(fleet: FleetClient, given: Given, _by: str) -> str:
+    """Answer a question; the first answer counts."""
+    enquiry = await fleet.answer(given["question"], given["answer"])
+    return f"answered: {safe(enquiry.question, 120)} → {safe(enquiry.answer or '', 120)}"
+
+
+async def stop(fleet: FleetClient, given: Given, _by: str) -> str:
+    """Have robots hold and do nothing until they are let go: all, or one."""
+    robots = (given["robot"],) if given.get("robot") else ()
+    answer = await fleet.stop(robots)
+    held = f"holding: {', '.join(answer.robots)}" if answer.robots else "no robot has confirmed yet"
+    problems = "".join(f"; NOT {name}: {why}" for name, why in sorted(answer.problems.items()))
+    silent = f"; not confirmed by {', '.join(answer.silent)}" if answer.silent else ""
+    return f"soft stop of {robots[0] if robots else 'the fleet'}: {held}{problems}{silent}"
+
+
+async def resume_robots(fleet: FleetClient, given: Given, _by: str) -> str:
+    """Lift the soft stops that the operator has seen: of all robots, or one."""
+    robots = (given["robot"],) if given.get("robot") else ()
+    answer = await fleet.resume_robots(robots, stops=[each for each in given.get("stops", "").split("/") if each])
+    left = f"; still stopped: {len(answer.stops)}" if answer.stops else ""
+    return f"{robots[0] if robots else 'all robots'} may move again{left}"
+
+
+_ROBOT = Parameter(kind="robot", name="robot")
+
+ROBOTS: tuple[Action, ...] = (
+    Action(
+        name="takeover",
+        title="Take over",
+        help="Take a robot over and move it by hand while a key is held",
+        keys=("o",),
+        screens=("robots", "robot"),
+        takes=(
+            _ROBOT,
+            Parameter(kind="text", name="why", optional=True, rest=True),
+        ),
+        writes=True,
+        call="takeover",
+    ),
+    Action(
+        name="give-back",
+        title="Give back",
+        help="Give the robot back and leave",
+        keys=("g",),
+        screens=("takeover",),
+        call="here give_back",
+    ),
+    Action(
+        name="answer",
+        title="Answer",
+        help="Answer what a robot or skill asks; the first answer counts",
+        keys=("A",),
+        screens=("robots", "robot"),
+        takes=(
+            Parameter(kind="enquiry", name="question"),
+            Parameter(kind="text", name="answer", rest=True),
+        ),
+        writes=True,
+        do=answer,
+    ),
+    Action(
+        name="stop",
+        title="STOP all",
+        help="Soft stop: all robots hold and do nothing until they are let go; no emergency stop. `:stop ROBOT`: one",
+        keys=("f8",),
+        takes=(Parameter(kind="robot", name="robot", optional=True),),
+        writes=True,
+        always=True,
+        do=stop,
+    ),
+    Action(
+        name="stop-robot",
+        title="Stop",
+        help="Soft stop of one robot",
+        keys=("x",),
+        screens=("robots", "robot"),
+        takes=(_ROBOT,),
+        writes=True,
+        always=True,
+        do=stop,
+    ),
+    Action(
+        name="resume-robots",
+        title="Let go",
+        help="Lift the soft stop of a robot, or of all",
+        keys=("z",),
+        screens=("robots", "robot"),
+        takes=(Parameter(kind="robot", name="robot", optional=True, chosen=True, absent="all robots"),),
+        writes=True,
+        dangerous=True,
+        confirm="Lift the soft stop of {robot}? It may move at once, as its task goes on. Is the way clear?",
+        sees_stops=True,
+        do=resume_robots,
+    ),
+)

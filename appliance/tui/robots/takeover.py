@@ -1,0 +1,257 @@
+"""A robot under an operator's hand: it moves while a key is held, and is given back when this screen is left.
+
+What keeps it safe when a terminal is lost stands at several places: a movement lasts half a second at the robot, keys
+that come no more count as let go (`holding`), and the lease ends at the gateways when it is not renewed.
+"""
+
+import asyncio
+import contextlib
+import time
+from typing import Any
+
+from rich.text import Text
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding
+from textual.widgets import Static
+
+from appliance.errors import ConflictError, SwiftbotError
+from appliance.model import Lease
+from appliance.tui.frame import FleetScreen
+from appliance.tui.keys import bindings
+from appliance.tui.robots.facts import place
+from appliance.tui.robots.ground import Ground
+from appliance.tui.robots.holding import LASTS_S, Holding, Moves
+from appliance.tui.robots.known import KnownRobots
+from appliance.tui.safe import safe
+from appliance.tui.store import Store
+
+TICK_S = 0.05
+SPEEDS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0)
+"""Metres a second; the robot's own limit holds besides."""
+TURN_DPS = 30.0
+GIVE_BACK_S = 3.0
+"""How long leaving waits for the robot to be given back; beyond it the lease ends by itself."""
+
+
+def velocity(move: str, speed_mps: float) -> dict[str, float]:
+    """Return the arguments of the verb `velocity` for a direction."""
+    wanted: dict[str, dict[str, float]] = {
+        Moves.FORWARD: {"forward_mps": speed_mps},
+        Moves.BACK: {"forward_mps": -speed_mps},
+        Moves.LEFT: {"left_mps": speed_mps},
+        Moves.RIGHT: {"left_mps": -speed_mps},
+        Moves.UP: {"up_mps": speed_mps / 2},
+        Moves.DOWN: {"up_mps": -speed_mps / 2},
+        Moves.TURN_LEFT: {"turn_dps": TURN_DPS},
+        Moves.TURN_RIGHT: {"turn_dps": -TURN_DPS},
+    }
+    return {"forward_mps": 0.0, "left_mps": 0.0, "up_mps": 0.0, "turn_dps": 0.0} | wanted.get(move, {})
+
+
+class Pad(Static, can_focus=True):
+    """Takes the keys; it has the focus as long as the screen is open."""
+
+    BINDINGS = [
+        Binding("up", "move('forward')", show=False),
+        Binding("down", "move('back')", show=False),
+        Binding("left", "move('turn left')", show=False),
+        Binding("right", "move('turn right')", show=False),
+        Binding("a", "move('left')", show=False),
+        Binding("d", "move('right')", show=False),
+        Binding("pageup", "move('up')", show=False),
+        Binding("pagedown", "move('down')", show=False),
+        Binding("space", "hold", show=False),
+        Binding("plus,equals_sign", "speed(1)", show=False),
+        Binding("minus", "speed(-1)", show=False),
+    ]
+
+    def action_move(self, move: str) -> None:
+        """Take a press or repeat of a direction."""
+        self._of().press(move)
+
+    def action_hold(self) -> None:
+        """Stop moving."""
+        self._of().release()
+
+    def action_speed(self, step: int) -> None:
+        """Move faster or slower from now on."""
+        self._of().change_speed(step)
+
+    def _of(self) -> "TakeoverScreen":
+        screen = self.screen
+        assert isinstance(screen, TakeoverScreen)  # noqa: S101 - only made there
+        return screen
+
+
+class TakeoverScreen(FleetScreen):
+    """One robot, taken over."""
+
+    scope = "takeover"
+    tab = "robots"
+    shows = ("robots", "tasks", "gateways", "enquiries", "stops")
+    BINDINGS = bindings("takeover")
+    DEFAULT_CSS = """
+    TakeoverScreen #pad { height: auto; padding: 0 1; border-bottom: solid $panel; }
+    TakeoverScreen #ground { height: 1fr; }
+    """
+
+    def __init__(self, robot: str, *, why: str = "") -> None:
+        super().__init__()
+        self.robot_id = robot
+        self.lease: Lease | None = None
+        """While it is ours."""
+        self._why = why
+        self._known = KnownRobots()
+        self._holding = Holding(time.monotonic())
+        self._speed = 2
+        self._problem = ""
+        self._pad_said: Any = None
+        self._ended = ""
+
+    def title_of(self) -> str:
+        """Return the robot."""
+        return f"{self.robot_id} by hand"
+
+    def body(self) -> ComposeResult:
+        """Make the parts."""
+        yield Pad(id="pad")
+        yield Ground(id="ground")
+
+    def on_mount(self) -> None:
+        """Take it over."""
+        self.query_one(Pad).focus()
+        self._keep()
+
+    # --- keys ------------------------------------------------------------------------------------------------------
+
+    def press(self, move: str) -> None:
+        """Take a press or repeat of a direction's key."""
+        if self.lease is not None:
+            self._holding.press(move, time.monotonic())
+
+    def release(self) -> None:
+        """Stop moving."""
+        self._holding.release(time.monotonic())
+
+    def change_speed(self, step: int) -> None:
+        """Move faster or slower from now on."""
+        self._speed = min(max(0, self._speed + step), len(SPEEDS) - 1)
+        self._holding.touch(time.monotonic())
+        self.flush(force=True)
+
+    def do_give_back(self, _given: object) -> None:
+        """Give it back and leave."""
+        self.application.pop_screen()
+
+    # --- the lease ---------------------------------------------------------------------------------------------------
+
+    @work(exclusive=True, group="lease")
+    async def _keep(self) -> None:
+        """Have the lease, as long as this screen is open and somebody is at the keys."""
+        orders = self.view.orders
+        try:
+            lease = await orders.take_over(self.robot_id, why=self._why)
+        except SwiftbotError as error:
+            self._end(f"{error.message} → {error.remedy or 'try again later'}")
+            return
+        self.lease = lease
+        self._holding = Holding(time.monotonic())
+        self.flush(force=True)
+        renewing = asyncio.create_task(self._keep_renewing(lease), name="lease")
+        try:
+            await self._drive(lease)
+        finally:
+            renewing.cancel()
+            self.lease = None
+            # Leaving cancels this worker; the robot is given back all the same.
+            await asyncio.shield(asyncio.create_task(self._give_back(lease), name="give back"))
+
+    async def _give_back(self, lease: Lease) -> None:
+        with contextlib.suppress(SwiftbotError, TimeoutError):
+            async with asyncio.timeout(GIVE_BACK_S):
+                await self.view.orders.give_back(lease)
+
+    async def _keep_renewing(self, lease: Lease) -> None:
+        while True:
+            await asyncio.sleep(lease.lease_s / 3)
+            try:
+                await self.view.orders.renew(lease)
+            except ConflictError as error:
+                self._end(error.message)
+                return
+            except SwiftbotError as error:
+                self._problem = f"the lease could not be renewed: {error.message}"
+
+    async def _drive(self, lease: Lease) -> None:
+        while not self._ended:
+            now = time.monotonic()
+            if not self.application.app_focus:
+                self._holding.release(now)
+            step = self._holding.due(now)
+            if step.give_back:
+                self._end("no key came for a while: given back")
+                return
+            try:
+                if step.move:
+                    await self._move(lease, step.move)
+                elif step.stop:
+                    await self._move(lease, "")
+            except ConflictError as error:
+                self._end(error.message)
+                return
+            except SwiftbotError as error:
+                self._problem = f"{error.message} {f'→ {error.remedy}' if error.remedy else ''}".rstrip()
+                self._holding.release(now)
+            self._draw_pad()
+            await asyncio.sleep(TICK_S)
+
+    async def _move(self, lease: Lease, move: str) -> None:
+        args = velocity(move, SPEEDS[self._speed]) | {"for_s": LASTS_S}
+        await self.view.orders.drive(lease, "velocity", timeout_s=2.0, **args)
+        self._problem = ""
+
+    def _end(self, why: str) -> None:
+        self._ended = why
+        self.flush(force=True)
+
+    # --- drawing -----------------------------------------------------------------------------------------------------
+
+    def draw_body(self, store: Store) -> None:
+        """Show the robot among the others."""
+        robots = self._known.of(store)
+        self.query_one(Ground).show(robots.values(), selected=self.robot_id, view=self.view)
+        self._draw_pad()
+
+    def _draw_pad(self) -> None:
+        if not self.ready:
+            return
+        now = time.monotonic()
+        left_s = self._holding.left_s(now)
+        robot = self.store.robots.get(self.robot_id)
+        said = (self.lease, self._holding.moving, round(left_s), self._speed, self._problem, self._ended, robot)
+        if said == self._pad_said:
+            return
+        self._pad_said = said
+        self.query_one(Pad).update(self._pad(left_s))
+
+    def _pad(self, left_s: float) -> Text:
+        robot = self.store.robots.get(self.robot_id)
+        at = f" · at {place(robot.pose)} m" if robot is not None else ""
+        if self._ended:
+            return Text.assemble(
+                ("▲ not under your hand: ", "bold yellow"), (safe(self._ended, 300), "yellow"), "\nEsc leaves"
+            )
+        if self.lease is None:
+            return Text("… taking it over", "dim")
+        moving = self._holding.moving
+        out = Text.assemble(
+            ("⇅ yours", "bold magenta"),
+            f"{at} · {SPEEDS[self._speed]:g} m/s · ",
+            (f"● {moving}" if moving else "‖ holds", "bold yellow" if moving else ""),
+            f" · given back without a key in {left_s:.0f} s\n",
+            ("hold ↑ ↓ to move, ← → to turn, a d sideways, PgUp PgDn up and down · Space holds · + − speed", "dim"),
+        )
+        if self._problem:
+            out.append(f"\n✘ {safe(self._problem, 300)}", "red")
+        return out

@@ -1,0 +1,357 @@
+"""What the terminal UI knows just now: the latest value of everything it has heard of, outside the widgets.
+
+Screens look at shelves and at what has changed on them since they last drew. Bounded; without Zenoh and Textual, so
+that a recorded log can fill it as well as a fleet.
+"""
+
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+from msgspec import Struct, structs
+
+from appliance.model import (
+    Act,
+    ContainerInfo,
+    Enquiry,
+    GatewayStatus,
+    Lifted,
+    LogLine,
+    Notice,
+    Phase,
+    RobotInfo,
+    RunEvent,
+    RunEventKind,
+    SoftStop,
+    TaskRecord,
+)
+from appliance.plane.once import Once
+from appliance.record.facts import RecorderStatus
+from appliance.robots.authority.stops import Stops
+from appliance.tui.safe import safe
+from appliance.tui.shelf import Shelf
+
+T = TypeVar("T")
+
+GATEWAYS = 1000
+ROBOTS = 5000
+CONTAINERS = 20_000
+RECORDERS = 20
+"""Most recorders remembered."""
+RECORDER_SILENT_S = 5.0
+"""A recorder tells of itself every second; without word for so long something is wrong with it."""
+SILENT = "silent"
+ENQUIRIES = 200
+LOST_KEPT_S = 3600.0
+"""For how long a gateway that went away is still shown, with since when."""
+STARTS = 400
+"""Latest starts of runs whose phase and time are remembered."""
+KINDS = (
+    "gateways",
+    "containers",
+    "robots",
+    "tasks",
+    "recorders",
+    "enquiries",
+    "stops",
+    "entries",
+    "starts",
+    "connection",
+    "asked",
+)
+"""What screens may say they show."""
+
+_EVENT_LEVELS = {RunEventKind.FAILED: "error", RunEventKind.PROGRESS: "debug", RunEventKind.PARTIAL: "debug"}
+
+
+class Connection(Struct, frozen=True, kw_only=True):
+    """How the line to the fleet is: `problem` is empty when all is well, else the cause; `remedy` what to do."""
+
+    connected: bool = False
+    problem: str = ""
+    remedy: str = ""
+    since_ns: int = 0
+    """Since when it is so, by this machine's clock, for people; 0: not told."""
+
+
+class Entry(Struct, frozen=True, kw_only=True):
+    """A line of the log screen. `serial` numbers them from 1 in the order heard."""
+
+    serial: int
+    at_ns: int
+    kind: str
+    """`notice`, `run`, `log` or `order`."""
+    level: str
+    source: str
+    text: str
+
+
+class Gateway(Struct, frozen=True, kw_only=True):
+    """A gateway: its last account of itself, and since when it cannot be reached."""
+
+    status: GatewayStatus
+    lost_ns: int = 0
+    """When it went away, by this machine's clock, for people; 0: it is there."""
+    latency_ms: float | None = None
+    """A question there and its answer back, measured from here; None: not measured."""
+    arc: float | None = None
+    """Share of the keys that are its own on the ring, 0 to 1; None: not known."""
+
+
+class Start(Struct, frozen=True):
+    """A run whose handler has begun: which phase of selection served it, and how long that took."""
+
+    phase: Phase | None
+    startup_ms: float
+
+
+class Store:
+    """The fleet as it is known just now.
+
+    Args:
+        tasks: Tasks kept; the oldest go first.
+        entries: Log lines kept.
+    """
+
+    def __init__(self, *, tasks: int = 2000, entries: int = 2000) -> None:
+        self.gateways: Shelf[Gateway] = Shelf(GATEWAYS)
+        self.containers: Shelf[ContainerInfo] = Shelf(CONTAINERS)
+        """By `gateway/container`."""
+        self.robots: Shelf[RobotInfo] = Shelf(ROBOTS)
+        self.tasks: Shelf[TaskRecord] = Shelf(tasks, age=_age)
+        self.recorders: Shelf[RecorderStatus] = Shelf(RECORDERS)
+        """By name; one not heard for a while has the state `silent`."""
+        self.enquiries: Shelf[Enquiry] = Shelf(ENQUIRIES, age=lambda enquiry: enquiry.at_ns)
+        """Questions to people, those that were answered too."""
+        self.stops = Stops()
+        """Soft stops and their liftings."""
+        self.asked: Shelf[object] = Shelf(1000)
+        """Answers to what a screen has asked for itself, by a key of its own such as `decisions/gw-1`."""
+        self.entries: deque[Entry] = deque(maxlen=entries)
+        """Log lines, oldest first."""
+        self.connection = Connection(problem="connecting", remedy="one moment")
+        self.starts: deque[Start] = deque(maxlen=STARTS)
+        """Latest starts of runs, oldest first."""
+        self._started = 0
+        self._serial = 0
+        self._connections = 0
+        self._stops_heard = 0
+        self._heard: dict[str, float] = {}
+        self._noticed = Once()
+        self._newest: tuple[int, tuple[str, ...]] = (-1, ())
+
+    # --- what has changed --------------------------------------------------------------------------------------
+
+    def revision(self, kind: str) -> int:
+        """Return what rises with every change of one of `KINDS`."""
+        if kind == "entries":
+            return self._serial
+        if kind == "connection":
+            return self._connections
+        if kind == "starts":
+            return self._started
+        if kind == "stops":
+            return self._stops_heard
+        shelf: Shelf[object] = getattr(self, kind)
+        return shelf.revision
+
+    def revisions(self, kinds: Iterable[str]) -> tuple[int, ...]:
+        """Return the revisions of several kinds: equal when nothing of them has changed."""
+        return tuple(map(self.revision, kinds))
+
+    def forget_all(self) -> None:
+        """Begin anew, as when a recorded log is played from another moment."""
+        for shelf in (
+            self.gateways,
+            self.containers,
+            self.robots,
+            self.tasks,
+            self.recorders,
+            self.enquiries,
+            self.asked,
+        ):
+            shelf.clear()
+        self.stops = Stops()
+        self._stops_heard += 1
+        self._heard.clear()
+        self.entries.clear()
+        self.starts.clear()
+        self._serial += 1
+        self._started += 1
+
+    # --- connection and gateways ---------------------------------------------------------------------------------
+
+    def tell(self, connection: Connection) -> None:
+        """Note how the line is; `since_ns` stays while the problem does."""
+        known = self.connection
+        if (known.connected, known.problem) == (connection.connected, connection.problem):
+            connection = structs.replace(connection, since_ns=known.since_ns)
+        elif not connection.since_ns:
+            connection = structs.replace(connection, since_ns=time.time_ns())
+        if connection != known:
+            self.connection = connection
+            self._connections += 1
+
+    def take_gateways(self, present: Mapping[str, GatewayStatus], now_ns: int) -> None:
+        """Take the gateways that are there; those that are not any more are kept as lost for a while.
+
+        Args:
+            present: their accounts of themselves.
+            now_ns: now, Unix nanoseconds.
+        """
+        for name, status in present.items():
+            known = self.gateways.get(name)
+            if known is None:
+                self.gateways.put(name, Gateway(status=status))
+            elif known.status is not status or known.lost_ns:
+                self.gateways.put(name, structs.replace(known, status=status, lost_ns=0))
+        for name, known in tuple(self.gateways.items()):
+            if name in present:
+                continue
+            if not known.lost_ns:
+                self.gateways.put(name, structs.replace(known, lost_ns=now_ns, latency_ms=None, arc=None))
+            elif now_ns - known.lost_ns > LOST_KEPT_S * 1e9:
+                self.gateways.drop(name)
+
+    def measured(self, gateway: str, *, latency_ms: float | None = None, arc: float | None = None) -> None:
+        """Note what was measured of a gateway from here; None leaves what is known."""
+        known = self.gateways.get(gateway)
+        if known is None or known.lost_ns:
+            return
+        latency_ms = known.latency_ms if latency_ms is None else round(latency_ms, 1)
+        self.gateways.put(gateway, structs.replace(known, latency_ms=latency_ms, arc=known.arc if arc is None else arc))
+
+    def take_containers(self, held: Mapping[str, Mapping[str, ContainerInfo]]) -> None:
+        """Take the containers of all gateways; others are gone."""
+        fresh = {f"{gateway}/{name}": info for gateway, each in held.items() for name, info in each.items()}
+        _take(self.containers, fresh)
+
+    def take_robots(self, robots: Mapping[str, RobotInfo]) -> None:
+        """Take the robots of the roster; others are gone."""
+        _take(self.robots, robots)
+
+    # --- tasks -----------------------------------------------------------------------------------------------------
+
+    def take_task(self, record: TaskRecord) -> bool:
+        """Take a task's record unless a later one is known; whether it was taken.
+
+        After a partition the version that stands may have fewer transitions than the one that lost: an end is news.
+        """
+        known = self.tasks.get(record.id)
+        ends = known is not None and record.state.final and not known.state.final
+        if known is not None and known.sequence > record.sequence and not ends:
+            return False
+        return self.tasks.put(record.id, record)
+
+    def take_tasks(self, records: Iterable[TaskRecord]) -> None:
+        """Take the answer to a question for all tasks."""
+        for record in records:
+            self.take_task(record)
+
+    def forget_task(self, task_id: str) -> None:
+        """Forget a task whose record was deleted."""
+        self.tasks.drop(task_id)
+
+    @property
+    def newest(self) -> tuple[str, ...]:
+        """Ids of the tasks, newest first."""
+        if self._newest[0] != self.tasks.arrangement:
+            order = sorted(self.tasks, key=lambda name: _age(self.tasks[name]), reverse=True)
+            self._newest = (self.tasks.arrangement, tuple(order))
+        return self._newest[1]
+
+    # --- recorders -------------------------------------------------------------------------------------------------
+
+    def take_recorder(self, status: RecorderStatus, now: float) -> None:
+        """Take a recorder's account of itself, heard at `now` (monotonic seconds); one that stopped is forgotten."""
+        if status.state == "stopped":
+            self._heard.pop(status.id, None)
+            self.recorders.drop(status.id)
+        elif status.id in self.recorders or len(self.recorders) < RECORDERS:
+            self._heard[status.id] = now
+            self.recorders.put(status.id, status)
+
+    def listen_for_silence(self, now: float) -> None:
+        """Mark recorders that were not heard for a while; nothing comes of them that would do so."""
+        for name, heard_at in self._heard.items():
+            status = self.recorders.get(name)
+            if status is not None and status.state != SILENT and now - heard_at >= RECORDER_SILENT_S:
+                self.recorders.put(name, structs.replace(status, state=SILENT))
+
+    def take_stops(self, stops: Iterable[SoftStop] = (), lifted: Iterable[Lifted] = ()) -> None:
+        """Take soft stops and liftings, in any order and as often as they come."""
+        if self.stops.merge(stops, lifted):
+            self.stops.forget()
+            self._stops_heard += 1
+
+    # --- the log ---------------------------------------------------------------------------------------------------
+
+    def take_notice(self, notice: Notice) -> None:
+        """Take a message to a person; what both sides of a partition have told is one message."""
+        if self._noticed.new(notice.id):
+            self.add(notice.at_ns, kind="notice", level="info", source=notice.to, text=notice.text)
+
+    def take_log(self, line: LogLine) -> None:
+        """Take a log line of a gateway."""
+        fields = " ".join(f"{key}={value}" for key, value in line.fields.items())
+        text = f"{line.event} {fields}".rstrip()
+        self.add(line.at_ns, kind="log", level=line.level.lower(), source=line.source, text=text)
+
+    def take_act(self, act: Act) -> None:
+        """Take what an operator ordered, here or elsewhere, and what came of it."""
+        why = f" ({act.why})" if act.why else ""
+        problem = f": {act.problem}" if act.problem else ""
+        text = f"{act.verb} {act.target}{why} → {act.outcome}{problem}"
+        level = "info" if act.outcome == "done" else "warning"
+        self.add(act.at_ns, kind="order", level=level, source=act.by, text=text)
+
+    def take_run(self, event: RunEvent, at_ns: int) -> None:
+        """Take news of a run."""
+        if event.kind is RunEventKind.STARTED and event.startup_ms is not None:
+            self._started += 1
+            self.starts.append(Start(event.phase, event.startup_ms))
+        parts = [f"{event.task}/{event.subtask}", str(event.kind)]
+        if event.attempt > 1:
+            parts.append(f"attempt {event.attempt}")
+        if event.phase is not None:
+            parts.append(str(event.phase))
+        if event.startup_ms is not None:
+            parts.append(f"start {event.startup_ms:.1f} ms")
+        if event.duration_ms is not None:
+            parts.append(f"took {event.duration_ms / 1000:.1f} s")
+        if event.kind is RunEventKind.PROGRESS:
+            parts.append(f"{event.progress:.0%}")
+        if event.note:
+            parts.append(event.note)
+        if event.failure is not None:
+            parts.append(f"{event.failure.message} {event.failure.remedy}".rstrip())
+        level = _EVENT_LEVELS.get(event.kind, "info")
+        self.add(at_ns, kind="run", level=level, source=event.gateway, text=" · ".join(parts))
+
+    def add(self, at_ns: int, *, kind: str, level: str, source: str, text: str) -> None:
+        """Add a line to the log screen; foreign text is cleaned, long lines are cut."""
+        self._serial += 1
+        self.entries.append(
+            Entry(
+                serial=self._serial,
+                at_ns=at_ns,
+                kind=kind,
+                level=safe(level, 12),
+                source=safe(source, 64),
+                text=safe(text),
+            )
+        )
+
+
+def _age(record: TaskRecord) -> tuple[int, str]:
+    return record.created_ns, record.id
+
+
+def _take(shelf: Shelf[T], fresh: Mapping[str, T]) -> None:
+    for key, value in fresh.items():
+        if shelf.get(key) is not value:
+            shelf.put(key, value)
+    if len(shelf) > len(fresh) or shelf.keys() != fresh.keys():
+        for key in [key for key in shelf if key not in fresh]:
+            shelf.drop(key)

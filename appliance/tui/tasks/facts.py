@@ -1,0 +1,241 @@
+"""Tasks and their subtasks as rows and text: state, place, phase, times, progress, results, errors and remedies."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+from rich.text import Text
+
+from appliance.model import (
+    PLAIN_PRIORITY,
+    Proposal,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+)
+from appliance.tui import signs
+from appliance.tui.drawing import Cell, bar, duration, milliseconds, told
+from appliance.tui.logs.lines import clock
+from appliance.tui.plans import shape
+from appliance.tui.plans.editing import params_text
+from appliance.tui.safe import safe, safe_lines
+
+# --- tasks -------------------------------------------------------------------------------------------------------
+
+
+def state_cell(record: TaskRecord) -> tuple[str, str]:
+    """Return a task's state with its sign, and its style; that it waits for an operator or is paused comes first."""
+    if record.paused:
+        return "‖ paused", "magenta"
+    if waits(record) is not None:
+        return "? approve", "bold yellow"
+    sign = signs.task(record.state)
+    return sign.text, sign.style
+
+
+def waits(record: TaskRecord) -> Proposal | None:
+    """Return the plan of a task that waits for an operator, if one does."""
+    if record.state.final or record.proposal is None or not record.proposal.waits:
+        return None
+    return record.proposal
+
+
+def done(record: TaskRecord) -> str:
+    """Return how many of its subtasks have succeeded."""
+    return f"{sum(each.state is SubtaskState.SUCCEEDED for each in record.subtasks)}/{len(record.subtasks)}"
+
+
+def progress(record: TaskRecord) -> float:
+    """Return a task's progress, 0 to 1: subtasks that ended, and the shares of those that run."""
+    if not record.subtasks:
+        return 1.0 if record.state is TaskState.SUCCEEDED else 0.0
+    shares = [
+        1.0 if each.state is SubtaskState.SUCCEEDED else min(1.0, max(0.0, each.progress)) for each in record.subtasks
+    ]
+    return sum(shares) / len(shares)
+
+
+def task_cells(record: TaskRecord) -> tuple[Cell, ...]:
+    """Return a task's row: id, state, done, when it was accepted, by whom, what was asked."""
+    what = safe(record.instruction, 300)
+    if record.priority != PLAIN_PRIORITY:
+        what = f"p{record.priority} {what}"
+    return (
+        (safe(record.id, 64), "bold"),
+        state_cell(record),
+        done(record),
+        clock(record.created_ns)[:8],
+        safe(record.submitter, 20),
+        what,
+    )
+
+
+def reason(record: TaskRecord) -> str:
+    """Return in a sentence why a task does not go on just now; empty when it does or has ended."""
+    if record.state.final:
+        return ""
+    if record.paused:
+        return safe(record.paused)
+    proposal = waits(record)
+    if proposal is not None:
+        left = proposal.since_s + proposal.expires_s - record.elapsed_s
+        expires = f"; expires in {duration(left)}" if proposal.expires_s else ""
+        return f"waits for approval: {safe(proposal.note, 200) or 'an operator is to look at its plan'}{expires}"
+    if record.state is TaskState.ACCEPTED:
+        return "being planned"
+    if any(each.state is SubtaskState.RUNNING for each in record.subtasks):
+        return ""
+    notes = [f"{each.subtask.id}: {each.note}" for each in record.subtasks if each.note and not each.state.final]
+    return safe("; ".join(notes[:3]) or record.note)
+
+
+def task_text(record: TaskRecord) -> Text:
+    """Draw a task: what was asked, why it waits, its plan as a graph, and what became of each subtask."""
+    out = Text.assemble((safe(record.id, 80), "bold"), " ", state_cell(record))
+    if record.coordinator:
+        out.append(f" · coordinated by {safe(record.coordinator, 63)}")
+    if record.submitter:
+        out.append(f" · from {safe(record.submitter, 40)}")
+    if record.deadline_s and not record.state.final:
+        out.append(f" · {duration(record.deadline_s - record.elapsed_s)} to its deadline", "yellow")
+    out.append(f"\n{safe(record.instruction, 2000)}\n")
+    if why := reason(record):
+        out.append(f"… {why}\n", "yellow")
+    if record.failure is not None:
+        out.append(f"✘ {told(record.failure)}\n", "red")
+    for each in record.revisions[-3:]:
+        out.append(f"▲ plan changed: {safe(each.note, 200)}\n", "yellow")
+    proposal = waits(record)
+    if not record.subtasks and proposal is not None:
+        out.append_text(plan_lines(proposal.plan.subtasks))
+        return out
+    for node in nodes(record).values():
+        out.append_text(subtask_lines(node.record, node.depth))
+    return out
+
+
+def plan_lines(subtasks: Sequence[Any]) -> Text:
+    """Draw a plan that does not run: a line a subtask, below what it comes after."""
+    level = shape.depths(subtasks)
+    by_id = {each.id: each for each in subtasks}
+    out = Text()
+    for name in shape.ordered(subtasks):
+        each = by_id[name]
+        out.append(shape.branch(level[name]), "dim")
+        out.append(f"{safe(each.id, 40)} ", "bold")
+        out.append(safe(each.skill, 60), "cyan")
+        out.append(f" {safe(each.robot or 'on a gateway', 63)}")
+        if each.params:
+            out.append(f"  {safe(params_text(each.params), 200)}", "dim")
+        if len(each.after) > 1:
+            out.append(f"  after {safe(', '.join(each.after), 80)}", "dim")
+        out.append("\n")
+    return out
+
+
+class Node(Struct, frozen=True):
+    """A subtask at its place in the graph."""
+
+    record: SubtaskRecord
+    depth: int
+
+
+# --- subtasks ----------------------------------------------------------------------------------------------------
+
+
+def subtask_lines(record: SubtaskRecord, depth: int) -> Text:
+    """Draw one subtask: what it is and how it stands, where and how long, and why it failed."""
+    sign = signs.subtask(record.state)
+    subtask = record.subtask
+    out = Text(shape.branch(depth), "dim")
+    out.append(f"{sign.glyph} {safe(subtask.id, 40)} ", f"bold {sign.style}")
+    out.append(safe(subtask.skill, 60), "cyan")
+    out.append(f" {safe(_robot(record) or 'on a gateway', 63)}")
+    if len(subtask.after) > 1:
+        out.append(f" after {safe(', '.join(subtask.after), 80)}", "dim")
+    out.append(f"  {sign.word}", sign.style)
+    if record.state is SubtaskState.RUNNING:
+        out.append(f" {bar(record.progress)}", sign.style)
+    out.append("\n")
+    margin = " " * (len(shape.branch(depth)) + 2)
+    facts = _facts(record)
+    if facts:
+        out.append(f"{margin}{' · '.join(facts)}\n", "dim")
+    if record.failure is not None and record.state is not SubtaskState.SUCCEEDED:
+        out.append(f"{margin}✘ {told(record.failure)}\n", "red")
+    return out
+
+
+def _robot(record: SubtaskRecord) -> str:
+    return record.bound_robot or record.subtask.robot or ""
+
+
+def _facts(record: SubtaskRecord) -> Sequence[str]:
+    facts = [
+        safe(record.gateway, 63),
+        str(record.phase or ""),
+        f"start {milliseconds(record.startup_ms)}" if record.startup_ms is not None else "",
+        f"took {milliseconds(record.duration_ms)}" if record.duration_ms is not None else "",
+        f"attempt {record.attempt}" if record.attempt > 1 else "",
+        f"is {safe(record.condition, 20)}" if record.condition else "",
+        safe(record.note, 200) if not record.state.final else "",
+        brief(record.result) if record.state is SubtaskState.SUCCEEDED else "",
+    ]
+    return [fact for fact in facts if fact]
+
+
+def subtask_cells(node: Node) -> tuple[Cell, ...]:
+    """Return a subtask's row of the graph: id, skill, robot, state, gateway, phase, startup, duration, attempt."""
+    record = node.record
+    sign = signs.subtask(record.state)
+    share = f" {min(1.0, max(0.0, record.progress)):.0%}" if record.progress and not record.state.final else ""
+    return (
+        (f"{shape.branch(node.depth)}{safe(record.subtask.id, 30)}", "bold"),
+        (safe(record.subtask.skill, 40), "cyan"),
+        safe(_robot(record) or "–", 40),
+        (f"{sign.text}{share}", sign.style),
+        safe(record.gateway or "–", 63),
+        str(record.phase or "–"),
+        milliseconds(record.startup_ms, "–"),
+        milliseconds(record.duration_ms, "–"),
+        str(record.attempt or "–"),
+    )
+
+
+def nodes(record: TaskRecord) -> dict[str, Node]:
+    """Return a task's subtasks in the order of its graph, with their depth, by id."""
+    subtasks = [each.subtask for each in record.subtasks]
+    level = shape.depths(subtasks)
+    by_id = {each.subtask.id: each for each in record.subtasks}
+    return {name: Node(record=by_id[name], depth=level[name]) for name in shape.ordered(subtasks)}
+
+
+def brief(result: Mapping[str, Any] | None) -> str:
+    """Return a result in few words: files by name, lists by length."""
+    parts: list[str] = []
+    for key, value in list((result or {}).items())[:20]:
+        if isinstance(value, Mapping):
+            name: Any = value.get("name")  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+            parts.append(f"{key}={name}" if name else key)
+        elif isinstance(value, list | tuple):
+            parts.append(f"{key}: {len(value)}")  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            parts.append(f"{key}={safe(value, 40)}")
+    return safe(" ".join(parts), 160)
+
+
+def whole(result: Mapping[str, Any], *, most_lines: int = 60) -> Text:
+    """Return a result in full, a field a line, as JSON where it is no text; long ones are cut with what is left out."""
+    out = Text()
+    for number, (key, value) in enumerate(result.items()):
+        if number >= most_lines:
+            out.append(f"… {len(result) - most_lines} further fields\n", "dim")
+            break
+        shown = value if isinstance(value, str) else msgspec.json.encode(value).decode(errors="replace")
+        lines = safe_lines(shown, most_lines=12, most=400)
+        out.append(f"{safe(key, 60)}: ", "cyan")
+        out.append("\n    ".join(lines) if lines else "(empty)")
+        out.append("\n")
+    return out

@@ -1,0 +1,233 @@
+"""Takes an instruction, with history and completion of names, shows its plan, and submits exactly that plan."""
+
+import uuid
+from collections.abc import Iterable
+
+from rich.text import Text
+from textual import on, work
+from textual.app import ComposeResult
+from textual.binding import Binding
+from textual.containers import Vertical, VerticalScroll
+from textual.screen import ModalScreen
+from textual.widgets import Input, Label, Static
+
+from appliance.errors import PlanError, SwiftbotError
+from appliance.model import Approval, Site, TaskRecord, TaskRequest
+from appliance.tasks.api import PlanAnswer
+from appliance.tui.data import View
+from appliance.tui.plans import shape
+from appliance.tui.plans.completing import common, completions
+from appliance.tui.plans.history import History
+from appliance.tui.safe import safe
+from appliance.tui.tasks.facts import plan_lines
+
+_ASK = "Enter plans it · Tab completes names · ↑ earlier ones · Esc leaves"
+_REVIEW = "Enter runs this plan · F2 edits it first · edit the line for another · Esc leaves"
+INSTRUCTION_LIMIT = 2000
+"""Characters of an instruction; a gateway refuses longer ones as well."""
+
+
+class InstructionInput(Input):
+    """The line: Tab completes, the arrows bring back earlier instructions."""
+
+    BINDINGS = [
+        Binding("tab", "complete", show=False),
+        Binding("up", "recall(-1)", show=False),
+        Binding("down", "recall(1)", show=False),
+    ]
+
+    def __init__(self, text: str, history: History, *, id: str) -> None:  # noqa: A002 - Textual's name
+        super().__init__(
+            text,
+            placeholder="e.g. drone_1: fly to the gate and take a picture",
+            max_length=INSTRUCTION_LIMIT,
+            select_on_focus=False,
+            id=id,
+        )
+        # Over a slow link a blinking cursor is traffic, and nothing else.
+        self.cursor_blink = False
+        self.names: tuple[str, ...] = ()
+        """Names that are completed."""
+        self._history = history
+        self._found: tuple[str, ...] = ()
+        self._turn = -1
+
+    def action_complete(self) -> None:
+        """Go on with what all completions have in common; once there, one after the other."""
+        if self._turn >= 0 and self.value in self._found:
+            self._turn = (self._turn + 1) % len(self._found)
+            self._put(self._found[self._turn])
+            return
+        self._found, self._turn = completions(self.value, self.names), -1
+        shared = common(self._found)
+        if len(shared) > len(self.value):
+            self._put(shared)
+        elif self._found:
+            self._turn = 0
+            self._put(self._found[0])
+
+    def action_recall(self, step: int) -> None:
+        """Bring back another instruction."""
+        self._put(self._history.older(self.value) if step < 0 else self._history.newer(self.value))
+
+    def _put(self, text: str) -> None:
+        self.value = text
+        self.cursor_position = len(text)
+
+
+def answer_text(answer: PlanAnswer) -> Text:
+    """Draw the answer to a question for a plan: the plan, and what each tier that was asked made of it."""
+    plan = answer.plan
+    count = len(plan.subtasks)
+    out = Text()
+    out.append(
+        f"{safe(plan.domain, 40)}: {count} subtask{'s' if count != 1 else ''}, {shape.at_once(plan)} at once · "
+        f"{plan.tier} tier, {plan.confidence:.0%} sure, {plan.latency_ms:.0f} ms\n",
+        "bold",
+    )
+    out.append_text(plan_lines(plan.subtasks))
+    for attempt in answer.attempts:
+        if not attempt.ok:
+            out.append(f"{attempt.tier} tier declined: {safe('; '.join(attempt.problems), 300)}\n", "dim")
+    return out
+
+
+def names_of(robots: Iterable[str], site: Site | None) -> tuple[str, ...]:
+    """Return the names that an instruction may have: robots, places with their aliases, objects."""
+    places = site.places.items() if site is not None else ()
+    found = [*robots, *(name for key, place in places for name in (key, *place.aliases))]
+    found += [each.name for each in site.objects] if site is not None else []
+    return tuple(dict.fromkeys(found))
+
+
+class SubmitDialog(ModalScreen[TaskRecord | None]):
+    """Takes an instruction, shows its plan, and submits exactly that plan when it is confirmed."""
+
+    BINDINGS = [
+        Binding("escape", "leave", "Leave", priority=True),
+        Binding("f2,ctrl+r", "review", "Edit first", priority=True),
+    ]
+
+    def __init__(self, view: View, history: History, *, instruction: str = "") -> None:
+        super().__init__()
+        self._view = view
+        self._history = history
+        self._first = instruction
+        # The id is made here, so that submitting again after a lost answer is the same task.
+        self._task_id = f"t-{uuid.uuid4().hex[:10]}"
+        self._answer: PlanAnswer | None = None
+        self._planned = ""
+        """The instruction that `_answer` is the plan of."""
+        self._busy = False
+
+    def compose(self) -> ComposeResult:
+        """Make the dialog."""
+        with Vertical(classes="dialog"):
+            yield Label("What shall the robots do?", classes="title")
+            yield InstructionInput(self._first, self._history, id="instruction")
+            with VerticalScroll(id="plan-box"):
+                yield Static(id="plan")
+            yield Static(_ASK, id="hint")
+
+    def on_mount(self) -> None:
+        """Learn the names, begin to write."""
+        field = self.query_one(InstructionInput)
+        field.focus()
+        field.names = names_of(sorted(self._view.store.robots), None)
+        self._learn()
+        if self._history.problem:
+            self._show(Text(safe(self._history.problem), "yellow"), _ASK)
+
+    @work(group="names")
+    async def _learn(self) -> None:
+        """Ask for the names of places; without an answer those of robots must do."""
+        try:
+            site = await self._view.orders.site()
+        except SwiftbotError:
+            return
+        if self.is_mounted:
+            self.query_one(InstructionInput).names = names_of(sorted(self._view.store.robots), site)
+
+    @on(Input.Changed, "#instruction")
+    def edited(self, event: Input.Changed) -> None:
+        """The shown plan is of another instruction: it must not be run any more."""
+        if self._answer is not None and event.value.strip() != self._planned:
+            self._answer = None
+            self._show(Text(), _ASK)
+
+    @on(Input.Submitted, "#instruction")
+    def entered(self, event: Input.Submitted) -> None:
+        """Plan the instruction, or run the plan that is shown for it."""
+        instruction = event.value.strip()
+        if self._busy:
+            return
+        if not instruction:
+            self._show(Text("Write an instruction first.", "yellow"), _ASK)
+        elif self._answer is None:
+            self._plan(instruction)
+        else:
+            self._submit(self._planned, self._answer, Approval.NEVER)
+
+    def action_review(self) -> None:
+        """Submit the plan so that it waits: it is edited and approved on a screen of its own."""
+        if self._answer is not None and not self._busy:
+            self._submit(self._planned, self._answer, Approval.ALWAYS)
+
+    @work(exclusive=True)
+    async def _plan(self, instruction: str) -> None:
+        self._busy = True
+        self._show(Text("planning …", "dim"), "nothing runs yet · Esc leaves")
+        try:
+            answer = await self._view.orders.plan(instruction)
+        except SwiftbotError as error:
+            self._fail(error)
+        else:
+            if self.query_one("#instruction", Input).value.strip() == instruction:
+                self._answer, self._planned = answer, instruction
+                self._show(answer_text(answer), _REVIEW)
+            else:
+                self._show(Text("The instruction was edited meanwhile.", "yellow"), _ASK)
+        finally:
+            self._busy = False
+
+    @work(exclusive=True)
+    async def _submit(self, instruction: str, answer: PlanAnswer, approval: Approval) -> None:
+        self._busy = True
+        self.query_one("#hint", Static).update("submitting …")
+        request = TaskRequest(
+            instruction=instruction,
+            id=self._task_id,
+            submitter=self._view.operator,
+            plan=answer.plan,
+            approval=approval,
+        )
+        try:
+            record = await self._view.orders.submit(request)
+        except SwiftbotError as error:
+            # The plan stays confirmed under the same task id: Enter again cannot make a second task.
+            text = answer_text(answer)
+            text.append(f"✘ {safe(error.message)}\n→ {safe(error.remedy)}", "red")
+            self._show(text, "Enter tries again · Esc leaves")
+        else:
+            self._history.add(instruction)
+            self.dismiss(record)
+        finally:
+            self._busy = False
+
+    def _fail(self, error: SwiftbotError) -> None:
+        text = Text(f"✘ {safe(error.message)}\n", "red")
+        if isinstance(error, PlanError):
+            for problem in error.problems:
+                text.append(f"  · {safe(problem)}\n", "red")
+        if error.remedy:
+            text.append(f"→ {safe(error.remedy)}", "yellow")
+        self._show(text, _ASK)
+
+    def _show(self, text: Text, hint: str) -> None:
+        self.query_one("#plan", Static).update(text)
+        self.query_one("#hint", Static).update(hint)
+
+    def action_leave(self) -> None:
+        """Leave without running anything more."""
+        self._history.rewind()
+        self.dismiss(None)
