@@ -18,6 +18,7 @@ from appliance.bench.pooled import SKILL, fleet_name, need_of, write_skill
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
+from appliance.llm.settings import LlmConfig
 from appliance.local_fleet import FleetState, Order
 from appliance.model import RunAccepted, RunEvent, RunEventKind, RunRequest
 from appliance.pool.settings import PoolConfig
@@ -38,7 +39,7 @@ async def running(
             gateways=len(pools),
             mavlink=0,
             zenoh=0,
-            base=GatewayConfig(id="gw-1", skills=(str(skills),)),
+            base=GatewayConfig(id="gw-1", llm=LlmConfig(tiers=("rules",)), skills=(str(skills),)),
             pools=pools,
         )
         state = await local_fleet.up(order, progress=progress)

@@ -9,6 +9,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from msgspec import Struct
@@ -118,8 +119,8 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
 
     At each budget: `fewer_at_budget`, percent fewer cold starts than keep-alive with the same budget;
     `fewer_at_waste`, the same against keep-alive's curve where it wastes as much (None: it never wastes so much);
-    `on_frontier`, whether no point of another policy is better by 5 % in one of the two (and by 0.1 % of the runs, less
-    is chance) at no more than 2 % worse in the other.
+    `on_frontier`, whether no point of another policy, with no more memory for its containers, is better by 5 % in one
+    of the two (and by 0.1 % of the runs, less is chance) at no more than 2 % worse in the other.
     """
     others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT} for each in curve]
     most_gb = 1.02 * max(each.wasted_gb for each in curves[KEEP_ALIVE])
@@ -136,14 +137,40 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
                 )
                 or (each.cold_percent <= 1.02 * mine.cold_percent and each.wasted_gb < 0.95 * mine.wasted_gb)
                 for each in others
+                if each.budget_mb <= mine.budget_mb
             ),
         }
         for mine, theirs in zip(curves[DEFAULT], curves[KEEP_ALIVE], strict=True)
     }
 
 
-def on_trace(trace: Trace, budgets_mb: Sequence[int], progress: Progress = lambda _: None) -> dict[str, Any]:
-    """Return every policy's curve on one trace, the clairvoyant ones beside them, and how the default stands."""
+def on_traces(
+    traces: Sequence[Trace], budgets_mb: Sequence[int], progress: Progress = lambda _: None
+) -> dict[str, Any]:
+    """Return every policy's curve, the clairvoyant ones beside them, and how the default stands.
+
+    Several traces are one kind of arrivals drawn with several seeds: each point is the mean over them, since on one
+    draw alone two good policies differ by more than they do in general.
+    """
+    played = [_play(trace, budgets_mb, progress) for trace in traces]
+    curves = {name: _mean([each[0][name] for each in played]) for name in played[0][0]}
+    bounds = [each[1] for each in played]
+    return {
+        "runs": sum(len(trace.arrivals) for trace in traces),
+        "hours": round(sum(trace.duration_s for trace in traces) / 3600, 1),
+        "images": len({each.image for each in traces[0].arrivals}),
+        "draws": len(traces),
+        "curves": {name: [_plain(each) for each in curve] for name, curve in curves.items()},
+        "bound_at_default_waste": [round(fmean(each), 3) for each in zip(*bounds, strict=True)],
+        "default": compare(curves),
+        "default_each_draw": [
+            {budget: stands["on_frontier"] for budget, stands in compare(each[0]).items()} for each in played
+        ],
+    }
+
+
+def _play(trace: Trace, budgets_mb: Sequence[int], progress: Progress) -> tuple[dict[str, list[Point]], list[float]]:
+    """Return every policy's curve on one trace, and the fewest cold starts (percent) with the default's idle memory."""
     chosen = policies()
     curves: dict[str, list[Point]] = {}
     tick_s = max(1.0, trace.duration_s / TICKS)
@@ -165,14 +192,24 @@ def on_trace(trace: Trace, budgets_mb: Sequence[int], progress: Progress = lambd
         for budget in budgets_mb
     ]
     bound = least_cold(trace, [each.wasted_gb * 1024 * trace.duration_s for each in curves[DEFAULT]])
-    return {
-        "runs": len(trace.arrivals),
-        "hours": round(trace.duration_s / 3600, 1),
-        "images": len({each.image for each in trace.arrivals}),
-        "curves": {name: [_plain(each) for each in curve] for name, curve in curves.items()},
-        "bound_at_default_waste": [round(100 * each / len(trace.arrivals), 3) for each in bound],
-        "default": compare(curves),
-    }
+    return curves, [100 * each / len(trace.arrivals) for each in bound]
+
+
+def _mean(curves: Sequence[Sequence[Point]]) -> list[Point]:
+    """Return the mean of one policy's curves over several draws of a trace."""
+    return [
+        Point(
+            budget_mb=same[0].budget_mb,
+            cold_percent=round(fmean(each.cold_percent for each in same), 3),
+            wasted_gb=round(fmean(each.wasted_gb for each in same), 4),
+            cold_ms_per_run=round(fmean(each.cold_ms_per_run for each in same), 2),
+            p99_ms=round(fmean(each.p99_ms for each in same), 1),
+            evictions=round(fmean(each.evictions for each in same)),
+            prewarmed=round(fmean(each.prewarmed for each in same)),
+            unused=round(fmean(each.unused for each in same)),
+        )
+        for same in zip(*curves, strict=True)
+    ]
 
 
 def over_gateways(
@@ -256,6 +293,7 @@ def run(
     budgets_mb: Sequence[int] = BUDGETS_MB,
     gateways: Sequence[int] = (1, 10, 100),
     seed: int = 1,
+    draws: int = 1,
     progress: Progress = lambda _: None,
 ) -> dict[str, Any]:
     """Play all policies on traces and return the figures.
@@ -266,21 +304,25 @@ def run(
         budgets_mb: memory budgets of a gateway.
         gateways: numbers of gateways for federated against local; with none, no fleet is simulated.
         seed: of the traces.
+        draws: each kind of trace is drawn so often, with this seed and those after it; points are means.
         progress: told what is being played.
 
     Raises:
-        ConfigError: there is no such trace, or the file is none.
+        ConfigError: there is no such trace, the file is none, or there are no draws.
     """
+    if draws < 1:
+        raise ConfigError(f"{draws} draws of a trace", remedy="at least 1")
     for name in traces:
         if name not in TRACES:
             raise ConfigError(f"no trace {name!r}", remedy=f"known: {', '.join(TRACES)}")
     began = time.perf_counter()
-    played = [TRACES[name](seed) for name in traces or (TRACES if recorded is None else ())]
+    seeds = range(seed, seed + draws)
+    played = [[TRACES[name](each) for each in seeds] for name in traces or (TRACES if recorded is None else ())]
     if recorded is not None:
-        played.append(read_any(recorded))
+        played.append([read_any(recorded)])
     result: dict[str, Any] = {
         "seed": seed,
-        "traces": {trace.name: on_trace(trace, budgets_mb, progress) for trace in played},
+        "traces": {drawn[0].name: on_traces(drawn, budgets_mb, progress) for drawn in played},
     }
     if gateways:
         result["gateways"] = over_gateways(gateways, seed=seed, budget_mb=2048, progress=progress)

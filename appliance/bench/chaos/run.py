@@ -8,22 +8,21 @@ comes back with its disk, but tasks may stand still until one that holds their r
 import asyncio
 import contextlib
 import shutil
-import signal
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Coroutine, Sequence
+from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from msgspec import Struct
+import msgspec
 
 from appliance.bench.chaos import account, plan
 from appliance.bench.chaos.account import Down, Follower, Submitted
 from appliance.bench.chaos.arena import Arena, Progress, Site, loopback
 from appliance.bench.chaos.ledger import LedgerFile, LedgerRobot
+from appliance.bench.chaos.outages import Conditions, carry_out
 from appliance.bench.net import space
-from appliance.bench.net.faults import REST_S, phases
 from appliance.bench.pooled import fleet_name, write_skill
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, SwiftbotError
@@ -31,6 +30,7 @@ from appliance.model import LogLine, TaskRecord, TaskRequest
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
+from appliance.tasks.check import check
 from appliance.tasks.machine import Transition
 
 ROBOTS = 4
@@ -79,32 +79,19 @@ def run(ctx):
 """
 
 
-class Options(Struct, frozen=True, kw_only=True):
+class Options(Conditions, frozen=True, kw_only=True):
     """What a run is made of."""
 
     gateways: int = 8
     tasks: int = 200
+    """Handed in over the first 80 % of the time."""
     seconds: float = 300.0
-    """How long gateways go down; tasks are handed in over the first 80 % of it."""
     every_s: float = 4.0
-    """Mean time between outages; 0: there are none."""
     freezes: float = 0.2
-    """Share of outages in which the gateway is only stopped and goes on later."""
-    down_at_once: int = 2
-    """r - 1: more than that is not what replication promises to survive without waiting."""
     settle_s: float = 120.0
     """How long tasks may take to end once everybody is up again."""
     containers: int = 1
     """Kept ready by each gateway."""
-    seed: int = 1
-    faults: tuple[str, ...] = ()
-    """Faults of the network that it goes through, one after the other (`net.faults`); each gateway has a network
-    namespace of its own then, and the process must be inside one (`net.space.enter`)."""
-    fault_s: float = 0.0
-    """How long each lasts; 0: as a full run has it."""
-    rest_s: float = REST_S
-    keep: str = ""
-    """Folder for logs of the run; empty: a temporary one, kept only when an invariant is broken."""
 
 
 class Trial:
@@ -154,30 +141,14 @@ class Trial:
         except SwiftbotError as error:
             self.submitted[each.task] = Submitted(task=each.task, accepted=False, problem=error.code)
 
-    async def outages(self, planned: Sequence[plan.Outage], began: float, progress: Progress) -> None:
-        """Have gateways go down and come back as planned."""
-        async with asyncio.TaskGroup() as group:
-            for each in planned:
-                await asyncio.sleep(max(0.0, began + each.at_s - time.monotonic()))
-                group.create_task(self._outage(each, began, progress))
-
-    async def _outage(self, each: plan.Outage, began: float, progress: Progress) -> None:
-        if each.gateway not in self.arena.up():
-            progress(f"{each.gateway} is not up when it should go down: see its log")
-            return
+    def noted(self, each: plan.Outage) -> Callable[[], None]:
+        """Note that a gateway goes down; what is returned notes that it is back."""
         down: Down = self.follower.down(each.gateway, each.kind, time.monotonic_ns(), time.time_ns())
-        if each.kind == "freeze":
-            self.arena.signal(each.gateway, signal.SIGSTOP)
-        else:
-            await self.arena.kill(each.gateway)
-        try:
-            await asyncio.sleep(max(0.0, began + each.until_s - time.monotonic()))
-        finally:
-            if each.kind == "freeze":
-                self.arena.signal(each.gateway, signal.SIGCONT)
-            else:
-                self.arena.start(each.gateway)
+
+        def back() -> None:
             down.until_ns = time.monotonic_ns()
+
+        return back
 
     async def ended(self, wanted: Sequence[plan.Wanted], *, wait_s: float, progress: Progress) -> None:
         """Wait until every task that was handed in has ended, at most so long."""
@@ -199,13 +170,18 @@ class Trial:
                 progress(f"{told} tasks are under way")
             await asyncio.sleep(1.0)
 
-    async def record(self, task: str) -> TaskRecord | None:
-        """Return a task's record as the fleet has it; None when it has none."""
+    async def record(self, task: str, *, patient: bool = False) -> TaskRecord | None:
+        """Return a task's record as the fleet has it; None when it has none.
+
+        `patient`: for ten seconds at least: right after a partition the gateway that is asked may not see the others.
+        """
         for _ in range(20):
             try:
                 return await self.client.task(task)
             except NotFoundError:
-                return None
+                if not patient:
+                    return None
+                await asyncio.sleep(0.5)
             except SwiftbotError:
                 await asyncio.sleep(0.5)
         return None
@@ -272,8 +248,9 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 
     Returns:
         `tasks` (`account.outcomes`), `effects` (`account.effects`), `downtime` (`account.downtime`), `takeovers` by
-        task, `held`: whether all invariants were; `kept`: the folder with the MCAP log, the ledger and the gateways'
-        logs when they were not, or when it was asked for.
+        task, `decisions`: what making the log's decisions again gave (`tasks.check`), `held`: whether all invariants
+        were; `kept`: the folder with the MCAP log, the ledger and the gateways' logs when they were not, or when it
+        was asked for.
 
     Raises:
         DeadlineError, PrerequisiteError: the fleet did not start.
@@ -283,12 +260,11 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
     async with trial(options, progress=progress) as it:
         result = await _run(it, _nothing(), seconds=options.seconds, progress=progress)
         folder = it.arena.directory
-    return keep(result, folder, asked=bool(options.keep))
+    return await asyncio.to_thread(keep, result, folder, asked=bool(options.keep))
 
 
 async def _on_a_bad_wire(options: Options, *, progress: Progress) -> dict[str, Any]:
-    names = tuple(f"gw-{number + 1}" for number in range(options.gateways))
-    planned = phases(options.faults, names, fault_s=options.fault_s, rest_s=options.rest_s, seed=options.seed)
+    names, planned = options.names(), options.phases()
     sides = next((phase.sides for phase in planned if phase.sides), ())
     seconds = planned[-1].until_s
     async with (
@@ -300,7 +276,7 @@ async def _on_a_bad_wire(options: Options, *, progress: Progress) -> dict[str, A
         folder = it.arena.directory
     result["faults"] = {each.name: each.until_s - each.at_s for each in planned}
     result["sides"] = sides
-    return keep(result, folder, asked=bool(options.keep))
+    return await asyncio.to_thread(keep, result, folder, asked=bool(options.keep))
 
 
 async def _nothing() -> dict[str, int]:
@@ -314,21 +290,12 @@ async def _run(
     wanted = plan.tasks(
         options.tasks, seconds=seconds * 0.8, robots=robots(), prefix=f"c{options.seed}-", seed=options.seed
     )
-    planned = ()
-    if options.every_s > 0:
-        planned = plan.outages(
-            it.arena.names,
-            seconds=seconds,
-            most=options.down_at_once,
-            every_s=options.every_s,
-            freezes=options.freezes,
-            seed=options.seed,
-        )
+    planned = options.outages(seconds)
     progress(f"{len(wanted)} tasks over {seconds * 0.8:.0f} s, {len(planned)} outages")
     began = time.monotonic()
     async with asyncio.TaskGroup() as group:
         group.create_task(it.submit(wanted, began))
-        group.create_task(it.outages(planned, began, progress))
+        group.create_task(carry_out(it.arena, planned, began, progress=progress, noted=it.noted))
         disturbing = group.create_task(faults)
     result = await judge(it, wanted, progress=progress)
     if frames := disturbing.result():
@@ -341,7 +308,8 @@ async def judge(it: Trial, wanted: Sequence[plan.Wanted], *, progress: Progress)
     began = time.monotonic()
     await it.ended(wanted, wait_s=it.options.settle_s, progress=progress)
     settled_s = time.monotonic() - began
-    records = {each.task: await it.record(each.task) for each in wanted}
+    accepted = {task for task, each in it.submitted.items() if each.accepted}
+    records = {each.task: await it.record(each.task, patient=each.task in accepted) for each in wanted}
     submitted = [it.submitted[each.task] for each in wanted]
     tasks = account.outcomes(submitted, records)
     effects = account.effects(wanted, records, it.file.read())
@@ -362,8 +330,31 @@ async def judge(it: Trial, wanted: Sequence[plan.Wanted], *, progress: Progress)
 
 
 def keep(result: dict[str, Any], folder: Path, *, asked: bool) -> dict[str, Any]:
-    """Name the folder of the logs in the result when there is a reason to look at them, else remove it."""
+    """Make the decisions in the run's logs again; name the folder when there is a reason to look there, else remove it.
+
+    A decision that comes out differently breaks the run as a doubled effect does.
+    """
+    result = with_check(result, sorted(folder.glob("record/*.mcap")))
     if asked or not result["held"]:
         return result | {"kept": str(folder), "log": [str(each) for each in sorted(folder.glob("record/*.mcap"))]}
     shutil.rmtree(folder, ignore_errors=True)
     return result
+
+
+def with_check(result: dict[str, Any], logs: Sequence[Path]) -> dict[str, Any]:
+    """Return a result with what `swiftbot log check` says of the run's logs."""
+    try:
+        report = check(logs)
+    except SwiftbotError as error:
+        return result | {"decisions": {"problem": error.message}}
+    decisions: dict[str, Any] = {
+        "checked": report.checked,
+        "unchecked": report.unchecked,
+        "diverged": report.diverged,
+        "problems": report.problems,
+    }
+    if report.divergences:
+        decisions["first"] = msgspec.to_builtins(report.divergences[0])
+        broken = [*result["broken"], f"{report.diverged} decisions come out differently"]
+        result = result | {"held": False, "broken": broken}
+    return result | {"decisions": decisions}

@@ -6,8 +6,10 @@ Zenoh's keep-alives, which go over each link whatever the ring does.
 
 import heapq
 import random
+from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Iterable
+from itertools import chain
 
 from msgspec import Struct
 
@@ -38,6 +40,9 @@ class Fleet:
         self._rounds: list[tuple[float, str]] | None = None
         """When whose next round is, once time passes by `run`."""
 
+        self._placed: list[tuple[int, str]] = []
+        """Where every gateway stands that ever was in it, in order."""
+
     @property
     def ring(self) -> Ring:
         """The true ring, which nobody in it need know."""
@@ -51,6 +56,8 @@ class Fleet:
                 name, ring, bound=self.bound, replicas=self.replicas, rng=self.rng, successors=successors
             )
             self.members[name] = Upkeep(view, rng=self.rng, now=self.now)
+            self._placed.append((view.origin, name))
+        self._placed.sort()
         return self
 
     def any(self) -> str:
@@ -58,8 +65,10 @@ class Fleet:
         return self.rng.choice(list(self.members))
 
     def owner(self, target: int) -> str:
-        """Whose a position is in truth; takes time when there are many."""
-        return min(self.members, key=lambda name: (self.members[name].view.origin - target) % RING_SIZE)
+        """Whose a position is in truth."""
+        at = bisect_left(self._placed, (target, ""))
+        order = chain(range(at, len(self._placed)), range(at))
+        return next(name for each in order if (name := self._placed[each][1]) in self.members)
 
     # --- what gateways do -------------------------------------------------------------------------------------
 
@@ -67,9 +76,11 @@ class Fleet:
         """Let a gateway join through one at random; False when its lookup failed."""
         if not self.members:
             view = View.alone(name, bound=self.bound, replicas=self.replicas)
+            insort(self._placed, (view.origin, name))
             self.members[name] = Upkeep(view, rng=self.rng, now=self.now)
             return True
         view = View(name, bound=self.bound, replicas=self.replicas)
+        insort(self._placed, (view.origin, name))
         joiner = Upkeep(view, rng=self.rng, now=self.now)
         view.hear([self.any()])
         lookup = self.lookup((view.origin + 1) % RING_SIZE, view, what="join")

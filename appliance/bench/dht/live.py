@@ -1,7 +1,8 @@
 """Put and get on loopback: 16 gateways' planes beside 16 nodes of the `kademlia` package, in turns in one run.
 
-Both sides are one process with one event loop and real sockets, store the same keys and values, and are asked through
-a node at random each time. They do not promise the same: a put here is a compare-and-set ordered by the key's owner
+Both sides have real sockets, store the same keys and values, and are asked through a node at random each time. In one
+process a side has one event loop for all its nodes; with a process for each, as gateways run, every message wakes
+another process. They do not promise the same: a put here is a compare-and-set ordered by the key's owner
 and synced to the disks of three gateways before it is acknowledged, where kademlia's last writer wins in memory and
 nothing is ever on a disk; `put_unsynced` shows what syncing costs.
 """
@@ -15,12 +16,15 @@ import random
 import secrets
 import sys
 import tempfile
-import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Protocol
 
+import msgspec
+
+from appliance.bench.dht import node
+from appliance.bench.dht.node import NodeOptions
 from appliance.bench.figures import ratio, summary
 from appliance.errors import SwiftbotError
 from appliance.local_fleet import free_port
@@ -31,6 +35,7 @@ KSIZE = 5
 """Copies of a value there; the package's own default, 20, would store it on every node."""
 REMEDY = "make ray (its environment has kademlia too), or SWIFTBOT_KADEMLIA_PYTHON=a Python that has kademlia"
 _SIDE = Path(__file__).with_name("kademlia_side.py")
+Layout = Literal["one process", "a process each"]
 _BLOCK = 50
 """Operations of one side before it is the other's turn."""
 _LINE_S = 60.0
@@ -52,26 +57,30 @@ def find_python() -> Path | None:
     return None
 
 
-async def run(*, nodes: int, count: int, progress: Callable[[str], None]) -> dict[str, Any]:
+async def run(
+    *, nodes: int, count: int, layout: Layout = "one process", progress: Callable[[str], None]
+) -> dict[str, Any]:
     """Measure `count` puts and gets on both sides.
 
     Returns:
         `swiftbot` and `kademlia`: `put`, `get` (and `put_unsynced`), each count, p50, p90, p99 and max in ms; the
         ratios of the medians. `kademlia` is `missing`, with how to install it, where it is not there.
+
+    Raises:
+        SwiftbotError: a side could not be started, or a gateway has not what was put.
     """
     python = find_python()
     async with AsyncExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="swiftbot-bench-"))
-        progress(f"{nodes} gateways on loopback")
-        ours = _Ours(await stack.enter_async_context(_planes(nodes, Path(folder))))
-        sides: dict[str, _Ours | _Theirs] = {"swiftbot": ours}
-        result: dict[str, Any] = {"nodes": nodes, "value_bytes": len(_VALUE)}
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="swiftbot-bench-")))
+        progress(f"{nodes} gateways on loopback, {layout}")
+        sides: dict[str, Side] = {"swiftbot": await _our_side(stack, nodes, folder, layout)}
+        result: dict[str, Any] = {"nodes": nodes, "layout": layout, "value_bytes": len(_VALUE)}
         if python is None:
             progress(f"kademlia is not installed: {REMEDY}")
             result["kademlia"] = {"missing": "kademlia is not installed", "remedy": REMEDY}
         else:
-            progress(f"{nodes} nodes of kademlia")
-            sides["kademlia"] = await stack.enter_async_context(_kademlia(python, nodes))
+            progress(f"{nodes} nodes of kademlia, {layout}")
+            sides["kademlia"] = await _kademlia(stack, python, nodes, layout)
         times: dict[str, dict[str, list[float]]] = {name: {"put": [], "get": []} for name in sides}
         times["swiftbot"]["put_unsynced"] = []
         for block in range(-(-count // _BLOCK)):
@@ -80,7 +89,8 @@ async def run(*, nodes: int, count: int, progress: Callable[[str], None]) -> dic
             for what in ("put", "get"):
                 for name, side in sides.items():
                     times[name][what] += await side.do(what, keys)
-            times["swiftbot"]["put_unsynced"] += await ours.do("put_unsynced", [f"{key}-u" for key in keys])
+            unsynced = [f"{key}-u" for key in keys]
+            times["swiftbot"]["put_unsynced"] += await sides["swiftbot"].do("put_unsynced", unsynced)
     figures = {name: {what: summary(found) for what, found in kinds.items()} for name, kinds in times.items()}
     for name, side in sides.items():
         result[name] = figures[name] | side.about()
@@ -93,28 +103,55 @@ async def run(*, nodes: int, count: int, progress: Callable[[str], None]) -> dic
     return result
 
 
+class Side(Protocol):
+    """One of the two."""
+
+    async def do(self, what: str, keys: list[str]) -> list[float]:
+        """Put or get these keys one after the other; returns how long each took, ms."""
+        ...
+
+    def about(self) -> dict[str, Any]:
+        """What else belongs to the result."""
+        ...
+
+
+async def _our_side(stack: AsyncExitStack, nodes: int, folder: Path, layout: Layout) -> Side:
+    if layout == "one process":
+        return _Ours(await stack.enter_async_context(_planes(nodes, folder)))
+    fleet = f"bench-{secrets.token_hex(4)}"
+    endpoints = [f"tcp/127.0.0.1:{free_port()}" for _ in range(nodes)]
+    processes: list[asyncio.subprocess.Process] = []
+    for number, listen in enumerate(endpoints):
+        options = NodeOptions(
+            fleet=fleet, gateway=f"g{number}", folder=str(folder / f"g{number}"), listen=listen,
+            connect=() if number == 0 else (endpoints[0],), members=nodes,
+        )  # fmt: skip
+        command = (sys.executable, "-m", "appliance.bench.dht.node", msgspec.json.encode(options).decode())
+        processes.append(await stack.enter_async_context(_process(*command)))
+    for process in processes:
+        await line_of(process, "ready")
+    return _Processes(processes, copies=PlaneConfig().replicas)
+
+
 class _Ours:
-    """Our side."""
+    """Our side in this process."""
 
     def __init__(self, planes: list[Plane]) -> None:
         self._planes = planes
 
     async def do(self, what: str, keys: list[str]) -> list[float]:
-        """Put or get these keys one after the other; returns how long each took, ms."""
+        """As `Side.do`."""
         times: list[float] = []
         for key in keys:
             dht = random.choice(self._planes).dht  # noqa: S311 - spreads load
-            began = time.perf_counter()
-            if what == "get":
-                if await dht.read(key) is None:
-                    raise SwiftbotError(f"{key} was put and is not there")
-            else:
-                await dht.write(key, _VALUE.encode(), expected=None, durable=what == "put")
-            times.append((time.perf_counter() - began) * 1e3)
+            told = await node.do(dht, {"op": what, "keys": [key], "value": _VALUE})
+            if told["failed"]:
+                raise SwiftbotError(f"{key} was put and is not there")
+            times += told["ms"]
         return times
 
     def about(self) -> dict[str, Any]:
-        """What else belongs to the result."""
+        """As `Side.about`."""
         return {"copies": self._planes[0].config.replicas}
 
 
@@ -142,41 +179,69 @@ async def _planes(nodes: int, folder: Path) -> AsyncGenerator[list[Plane]]:
             await plane.close()
 
 
-class _Theirs:
-    """The side of kademlia: a process that obeys."""
+class _Processes:
+    """A side of processes that obey, each with one node or all of them."""
 
-    def __init__(self, process: asyncio.subprocess.Process, version: str) -> None:
-        self._process = process
-        self._version = version
+    def __init__(self, processes: list[asyncio.subprocess.Process], **about: Any) -> None:
+        self._processes = processes
+        self._about = about
         self._failed = 0
 
     async def do(self, what: str, keys: list[str]) -> list[float]:
-        """As `_Ours.do`."""
-        if self._process.stdin is None:
-            raise SwiftbotError("kademlia's side has no pipes")
-        self._process.stdin.write(json.dumps({"op": what, "keys": keys, "value": _VALUE}).encode() + b"\n")
-        told = await line_of(self._process, what)
+        """As `Side.do`; what takes the time is measured within the process."""
+        if len(self._processes) == 1:
+            return await self._ask(self._processes[0], what, keys)
+        times: list[float] = []
+        for key in keys:
+            times += await self._ask(random.choice(self._processes), what, [key])  # noqa: S311 - spreads load
+        return times
+
+    async def all(self, what: str) -> None:
+        """Have every process do something, one after the other."""
+        for process in self._processes:
+            await self._ask(process, what, [])
+
+    async def _ask(self, process: asyncio.subprocess.Process, what: str, keys: list[str]) -> list[float]:
+        if process.stdin is None:
+            raise SwiftbotError("a side has no pipes")
+        process.stdin.write(json.dumps({"op": what, "keys": keys, "value": _VALUE}).encode() + b"\n")
+        told = await line_of(process, what)
         self._failed += int(told["failed"])
         return [float(each) for each in told["ms"]]
 
     def about(self) -> dict[str, Any]:
-        """What else belongs to the result."""
-        return {"copies": KSIZE, "version": self._version, "failed": self._failed}
+        """As `Side.about`."""
+        return {**self._about, "failed": self._failed}
+
+
+async def _kademlia(stack: AsyncExitStack, python: Path, nodes: int, layout: Layout) -> Side:
+    port = random.randrange(_FIRST_PORT, _LAST_PORT)  # noqa: S311 - a range of UDP ports that is likely free
+    each = [(nodes, port)] if layout == "one process" else [(1, port + number) for number in range(nodes)]
+    processes: list[asyncio.subprocess.Process] = []
+    version = ""
+    for count, at in each:
+        # -P: this folder is no place to import from.
+        command = (str(python), "-P", str(_SIDE), str(count), str(KSIZE), str(at), str(port))
+        process = await stack.enter_async_context(_process(*command, plain=True))
+        processes.append(process)
+        version = str((await line_of(process, "ready"))["version"])
+    side = _Processes(processes, copies=KSIZE, version=version)
+    if len(processes) > 1:
+        await side.all("bootstrap")  # the first nodes learn of the last only in a second round
+    return side
 
 
 @asynccontextmanager
-async def _kademlia(python: Path, nodes: int) -> AsyncGenerator[_Theirs]:
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
-    port = random.randrange(_FIRST_PORT, _LAST_PORT)  # noqa: S311 - a range of UDP ports that is likely free
-    # -P: this folder is no place to import from.
+async def _process(*command: str, plain: bool = False) -> AsyncGenerator[asyncio.subprocess.Process]:
+    """A process with pipes; ended afterwards. `plain`: another Python, which must not see this one's packages."""
+    hidden = ("PYTHON", "VIRTUAL_ENV") if plain else ()
+    environment = {key: value for key, value in os.environ.items() if not hidden or not key.startswith(hidden)}
     process = await asyncio.create_subprocess_exec(
-        str(python), "-P", str(_SIDE), str(nodes), str(KSIZE), str(port),
-        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
         limit=2**24, env=environment,
     )  # fmt: skip
     try:
-        ready = await line_of(process, "ready")
-        yield _Theirs(process, str(ready["version"]))
+        yield process
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
@@ -186,16 +251,16 @@ async def _kademlia(python: Path, nodes: int) -> AsyncGenerator[_Theirs]:
 async def line_of(process: asyncio.subprocess.Process, event: str) -> dict[str, Any]:
     """Return the next line of a side, which must be of that event; SwiftbotError otherwise."""
     if process.stdout is None or process.stderr is None:
-        raise SwiftbotError("kademlia's side has no pipes")
+        raise SwiftbotError("a side has no pipes")
     try:
         async with asyncio.timeout(_LINE_S):
             line = await process.stdout.readline()
     except TimeoutError:
-        raise SwiftbotError(f"kademlia's side told no {event} within {_LINE_S:g} s") from None
+        raise SwiftbotError(f"a side told no {event} within {_LINE_S:g} s") from None
     if not line:
         problem = (await process.stderr.read(2**16)).decode(errors="replace").strip()
-        raise SwiftbotError(f"kademlia's side ended: {problem[-400:] or 'without a word'}", remedy=REMEDY)
+        raise SwiftbotError(f"a side ended: {problem[-400:] or 'without a word'}", remedy=REMEDY)
     told: dict[str, Any] = json.loads(line)
     if told.get("event") != event:
-        raise SwiftbotError(f"kademlia's side told {str(told)[:80]}, not {event}")
+        raise SwiftbotError(f"a side told {str(told)[:80]}, not {event}")
     return told

@@ -5,11 +5,15 @@ without an owner or at another than the first survivor from the position on. Cou
 """
 
 import math
+import os
 import random
 import statistics
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
+from multiprocessing import get_context
+from typing import Any, NamedTuple
 
 from appliance.bench.dht import chord
 from appliance.bench.dht.fleet import FRAMING, Fleet
@@ -20,7 +24,11 @@ from appliance.plane.overlay.view import View, successor_count
 from appliance.plane.ring import Ring, position
 
 REPLICAS = 3
+PARTS = ("hops", "join", "failures", "traffic")
 _KEYS = 100_000
+_MANY = 1000
+_FAILING = 1000
+"""Besides the largest ring the one that failures are counted for."""
 _SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
 
 Progress = Callable[[str], None]
@@ -31,47 +39,77 @@ def view_bound(members: int) -> int:
     return int(4 * math.log2(members))
 
 
-def run(sizes: Sequence[int], *, lookups: int, seconds: float, seed: int, progress: Progress) -> dict[str, Any]:
-    """Run all parts for these ring sizes.
+def run(
+    sizes: Sequence[int], *, lookups: int, seconds: float, seed: int, progress: Progress,
+    parts: Collection[str] = PARTS,
+) -> dict[str, Any]:  # fmt: skip
+    """Run these parts for these ring sizes.
 
     Args:
-        sizes: Members of the rings.
+        sizes: Members of the rings; failures are counted for those of 1,000 and for the largest.
         lookups: Lookups behind each figure.
-        seconds: Simulated time of each figure of traffic, after as long to settle.
+        seconds: Simulated time of each figure of traffic, after as long to settle; half of it beyond 1,000 members.
         seed: Of everything drawn.
         progress: Told what is being done.
+        parts: Any of `PARTS`.
     """
-    hop: dict[str, Any] = {}
-    moved: dict[str, Any] = {}
-    failed: dict[str, Any] = {}
-    traffic: dict[str, Any] = {}
-    for size in sizes:
-        progress(f"ring of {size:,}: hops and joins")
-        hop[str(size)] = hops(size, lookups=lookups, seed=seed)
-        moved[str(size)] = joins(size, seed=seed)
-    for size in sizes:
-        if size >= 1000 or size == max(sizes):
-            progress(f"ring of {size:,}: failures")
-            failed[str(size)] = failures(size, lookups=lookups, seed=seed)
-    for size in sizes:
-        progress(f"ring of {size:,}: bytes at rest and under churn")
-        traffic[str(size)] = bytes_sent(size, seconds=seconds, lookups=lookups // 4, seed=seed)
-    return {
-        "seed": seed,
-        "lookups": lookups,
-        "hops": hop,
-        "hops_published": chord.HOPS_SOURCE,
-        "join": moved,
-        "failures": failed,
-        "failures_published": {
+    jobs = [job for size in sizes for job in _jobs(size, max(sizes), lookups, seconds, seed) if job.part in parts]
+    found: dict[str, dict[str, Any]] = {part: {} for part in PARTS if part in parts}
+    for job, result in zip(jobs, _all(jobs, progress), strict=True):
+        found[job.part].setdefault(str(job.size), {}).update(result)
+    told: dict[str, Any] = {"seed": seed, "lookups": lookups, **found}
+    if "hops" in parts:
+        told["hops_published"] = chord.HOPS_SOURCE
+    if "failures" in parts:
+        told["failures_published"] = {
             "source": chord.FAILURES_SOURCE,
             "theorem": chord.FAILURES_THEOREM,
-            **{
-                f"{each.share:.0%}": {"hops": each.mean_hops, "timeouts": each.mean_timeouts} for each in chord.FAILURES
-            },
-        },
-        "traffic": traffic,
-    }
+            **{f"{share:.0%}": {"failed_percent": chord.failed_percent(share)} for share in _SHARES},
+        }
+    return told
+
+
+def _jobs(size: int, largest: int, lookups: int, seconds: float, seed: int) -> list["_Job"]:
+    """All that is counted of a ring."""
+    # A mean over so many members needs less time to be as exact.
+    for_s = seconds if size <= _MANY else seconds / 2
+    jobs = [
+        _Job("hops", size, partial(hops, size, lookups=lookups, seed=seed)),
+        _Job("join", size, partial(joins, size, seed=seed)),
+        _Job("traffic", size, partial(bytes_sent, size, seconds=for_s, lookups=lookups // 4, seed=seed)),
+    ]
+    if size in (_FAILING, largest):
+        jobs += [
+            _Job("failures", size, partial(failures, size, lookups=lookups, seed=seed, lengths=(length,)))
+            for length in successor_lengths(size)
+        ]
+    return jobs
+
+
+class _Job(NamedTuple):
+    """One figure of one ring; each has its own seeded numbers, so that the order does not matter."""
+
+    part: str
+    size: int
+    work: Callable[[], dict[str, Any]]
+
+    def weight(self) -> float:
+        """About how long it takes beside others."""
+        return self.size * {"traffic": 5.0, "hops": 1.5, "failures": 1.0, "join": 0.3}[self.part]
+
+
+def _all(jobs: Sequence[_Job], progress: Progress) -> list[dict[str, Any]]:
+    """Do all jobs, those that take longest first, on as many processes as there are processors."""
+    pool = ProcessPoolExecutor(max_workers=min(len(jobs), os.cpu_count() or 1), mp_context=get_context("spawn"))
+    try:
+        running = {pool.submit(job.work): job for job in sorted(jobs, key=_Job.weight, reverse=True)}
+        for number, done in enumerate(as_completed(running)):
+            job = running[done]
+            progress(f"{number + 1} of {len(jobs)}: ring of {job.size:,}, {job.part}")
+        results = {id(job): done.result() for done, job in running.items()}
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return [results[id(job)] for job in jobs]
 
 
 def names_of(size: int) -> list[str]:
@@ -138,12 +176,16 @@ def joins(size: int, *, seed: int, count: int = 20, keys: int = _KEYS) -> dict[s
     return found
 
 
-def failures(size: int, *, lookups: int, seed: int) -> dict[str, Any]:
+def successor_lengths(size: int) -> tuple[int, ...]:
+    """Lengths of the successor list that failures are counted for; the largest is the one that grows with the ring."""
+    return tuple(sorted({3, 5, 10, math.ceil(math.log2(size)), successor_count(size, view_bound(size))}))
+
+
+def failures(size: int, *, lookups: int, seed: int, lengths: Sequence[int] = ()) -> dict[str, Any]:
     """Lookups after a share of all members died at once and nothing was mended, by length of the successor list."""
     bound = view_bound(size)
-    grown = successor_count(size, bound)
-    found: dict[str, Any] = {"grown_successors": grown}
-    for length in sorted({3, 5, 10, math.ceil(math.log2(size)), grown}):
+    found: dict[str, Any] = {"grown_successors": successor_count(size, bound)}
+    for length in lengths or successor_lengths(size):
         rows: dict[str, Any] = {}
         fleet = Fleet(bound=bound, seed=seed, replicas=REPLICAS).settled(names_of(size), successors=length)
         everybody, ring = dict(fleet.members), fleet.ring
@@ -158,18 +200,21 @@ def failures(size: int, *, lookups: int, seed: int) -> dict[str, Any]:
 
 def _after(fleet: Fleet, before: Ring, lookups: int) -> dict[str, Any]:
     ring, alive = fleet.ring, list(fleet.members)
-    failed = unreplicated = 0
+    failed = unreplicated = unowned = 0
     done: list[Lookup] = []
     for _ in range(lookups):
         target = fleet.rng.getrandbits(160)
         lookup = fleet.lookup(target, fleet.members[fleet.rng.choice(alive)].view)
         failed += lookup.result is None or lookup.result.owner != ring.holders(target, 1)[0]
-        unreplicated += not any(name in fleet.members for name in before.holders(target, REPLICAS))
+        holders = before.holders(target, REPLICAS)
+        unowned += holders[0] not in fleet.members
+        unreplicated += not any(name in fleet.members for name in holders)
         done.append(lookup)
     return {
         "failed_percent": round(100 * failed / lookups, 3),
         "hops": _mean([each.hops for each in done]),
         "timeouts": _mean([len(each.gone) for each in done]),
+        "owner_dead_percent": round(100 * unowned / lookups, 3),
         "all_replicas_dead_percent": round(100 * unreplicated / lookups, 3),
     }
 

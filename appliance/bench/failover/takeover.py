@@ -93,7 +93,7 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 
     Returns:
         For `kill` and `freeze`: `detected` by the successor and `detected_by_all`, ms after the signal; `adopted`, ms
-        after the successor's detection; and counts of tasks.
+        after the successor's detection, and the parts of that (`settled`, `written`); and counts of tasks.
     """
     result: dict[str, Any] = {"gateways": options.gateways, "lease_ms": options.lease_ms, "goal_ms": GOAL_MS}
     with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
@@ -124,6 +124,8 @@ class _Rounds:
         self._arena = arena
         self._client = client
         self._progress = progress
+        self._lines: dict[LogTail, list[dict[str, Any]]] = {}
+        """What was read of a log after a loss."""
 
     async def run(self, how: Literal["kill", "freeze"], rounds: int) -> dict[str, Any]:
         """Lose so many coordinators, one after the other."""
@@ -131,6 +133,7 @@ class _Rounds:
         detected: list[float] = []
         by_all: list[float] = []
         adopted: list[float] = []
+        parts: dict[str, list[float]] = {"settled": [], "taken_up": [], "written": []}
         tasks = 0
         problems: list[str] = []
         for number in range(rounds):
@@ -144,6 +147,7 @@ class _Rounds:
                 for name in self._arena.names
                 if name != victim
             }
+            self._lines.clear()
             at = time.time()
             if how == "kill":
                 await self._arena.kill(victim)
@@ -156,6 +160,8 @@ class _Rounds:
                 seen_at = lost[transition.coordinator]
                 detected.append((seen_at - at) * 1e3)
                 adopted.append((adopted_at - seen_at) * 1e3)
+                for part, took_ms in (await self._parts(tails[transition.coordinator], task, seen_at)).items():
+                    parts[part].append(took_ms)
             self._progress(
                 f"{how} {number + 1} of {rounds}: {victim} with {len(theirs)} tasks, seen after {by_all[-1]:.0f} ms, "
                 f"adopted {adopted[-1]:.0f} ms later"
@@ -176,6 +182,7 @@ class _Rounds:
             "detected": summary(detected),
             "detected_by_all": summary(by_all),
             "adopted_after_detection": summary(adopted),
+            "parts": {part: summary(took_ms) for part, took_ms in parts.items()},
         }
 
     async def _submit(self, prefix: str) -> list[str]:
@@ -228,6 +235,33 @@ class _Rounds:
         except TimeoutError:
             raise DeadlineError(f"nobody took {task} over from {victim} within {STEP_S:g} s") from None
         return found
+
+    async def _parts(self, tail: LogTail, task: str, seen_at: float) -> dict[str, float]:
+        """What the time between the loss and the takeover of a task went into, by the successor's own log.
+
+        `settled`: its shard compared with the others'; `taken_up`: until the driver of the task began to write;
+        `written`: the record with the new coordinator.
+        """
+        lines = self._lines.setdefault(tail, [])
+
+        def is_adoption(line: dict[str, Any]) -> bool:
+            return line.get("event") == "task adopted" and line.get("task") == task
+
+        if not any(is_adoption(line) for line in lines):
+            lines += await tail.up_to(is_adoption, f"{task} adopted", wait_s=STEP_S)
+        adopted = next(line for line in lines if is_adoption(line))
+        at, wrote_ms = wall_s(adopted), float(adopted["wrote_ms"])
+        settled = [
+            wall_s(line)
+            for line in lines
+            if line.get("event") == "shard settled" and line.get("why") == "loss" and seen_at <= wall_s(line) <= at
+        ]
+        settled_at = settled[0] if settled else seen_at
+        return {
+            "settled": (settled_at - seen_at) * 1e3,
+            "taken_up": max(0.0, (at - settled_at) * 1e3 - wrote_ms),
+            "written": wrote_ms,
+        }
 
     async def _ended(self, heard: Heard, names: list[str]) -> list[str]:
         """Wait for the end of all tasks; returns those that did not succeed once and for all."""

@@ -7,7 +7,6 @@ be equal in the end, hold what somebody wrote, and descend from every write that
 import asyncio
 import contextlib
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -18,17 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec import Struct
 
 from appliance.bench.chaos.arena import Arena, Progress, Site, loopback
-from appliance.bench.chaos.plan import Outage, outages
+from appliance.bench.chaos.outages import Conditions, carry_out
 from appliance.bench.history import convergence, linearizable
 from appliance.bench.history.clients import Client, History
 from appliance.bench.net import space
-from appliance.bench.net.faults import REST_S, Phase, phases
+from appliance.bench.net.faults import Phase
 from appliance.bench.pooled import fleet_name
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError
+from appliance.llm.settings import LlmConfig
 from appliance.plane.messages import Found, KeyAsk
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
@@ -40,7 +39,7 @@ HEAL_S = 60.0
 """How long the fleet may take to be whole again, and replicas to be equal: several rounds of anti-entropy."""
 
 
-class Options(Struct, frozen=True, kw_only=True):
+class Options(Conditions, frozen=True, kw_only=True):
     """What a run is made of."""
 
     gateways: int = 5
@@ -50,15 +49,8 @@ class Options(Struct, frozen=True, kw_only=True):
     quorum: bool = True
     every_s: float = 3.0
     freezes: float = 0.4
-    down_at_once: int = 2
     pause_s: float = 0.02
     """Mean pause of a client between two operations."""
-    seed: int = 1
-    faults: tuple[str, ...] = ()
-    """Faults of the network, one after the other; see `chaos.run.Options`."""
-    fault_s: float = 0.0
-    rest_s: float = REST_S
-    keep: str = ""
 
 
 @asynccontextmanager
@@ -73,7 +65,7 @@ async def planes(
         directory=folder,
         sites=sites,
         pool=PoolConfig(),
-        base=GatewayConfig(id="gw-1", plane=PlaneConfig(voters=tuple(sites))),
+        base=GatewayConfig(id="gw-1", llm=LlmConfig(tiers=("rules",)), plane=PlaneConfig(voters=tuple(sites))),
         command=(sys.executable, "-m", "appliance.bench.history.node"),
     )
     arena.prepare()
@@ -154,26 +146,6 @@ class Trial:
                 raise DeadlineError(f"the fleet is not whole after {HEAL_S:g} s: {failed[0]} cannot be read")
             await asyncio.sleep(0.5)
 
-    async def faults(self, planned: Sequence[Outage], began: float) -> None:
-        """Have gateways go down and come back as planned."""
-        async with asyncio.TaskGroup() as group:
-            for each in planned:
-                await asyncio.sleep(max(0.0, began + each.at_s - time.monotonic()))
-                group.create_task(self._outage(each, began))
-
-    async def _outage(self, each: Outage, began: float) -> None:
-        if each.kind == "freeze":
-            self.arena.signal(each.gateway, signal.SIGSTOP)
-        else:
-            await self.arena.kill(each.gateway)
-        try:
-            await asyncio.sleep(max(0.0, began + each.until_s - time.monotonic()))
-        finally:
-            if each.kind == "freeze":
-                self.arena.signal(each.gateway, signal.SIGCONT)
-            else:
-                self.arena.start(each.gateway)
-
     async def last_reads(self) -> None:
         """Read every key through every gateway, as part of the history."""
         for name, session in self.sessions.items():
@@ -220,8 +192,7 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
     """
     if not options.faults:
         return await _run(options, None, (), seconds=options.seconds, progress=progress)
-    names = tuple(f"gw-{number + 1}" for number in range(options.gateways))
-    bad = phases(options.faults, names, fault_s=options.fault_s, rest_s=options.rest_s, seed=options.seed)
+    names, bad = options.names(), options.phases()
     async with space.net(names, seed=options.seed) as wire:
         seconds = bad[-1].until_s + options.rest_s
         return await _run(options, wire, bad, seconds=seconds, progress=progress)
@@ -230,27 +201,18 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 async def _run(
     options: Options, wire: space.Net | None, bad: Sequence[Phase], *, seconds: float, progress: Progress
 ) -> dict[str, Any]:
-    planned: tuple[Outage, ...] = ()
     sites = wire.sites if wire is not None else None
     async with planes(options, progress=progress, sites=sites) as arena, contextlib.AsyncExitStack() as stack:
         trial = Trial(options, arena)
         clients = await trial.connect(stack)
-        if options.every_s > 0:
-            planned = outages(
-                arena.names,
-                seconds=seconds,
-                most=options.down_at_once,
-                every_s=options.every_s,
-                freezes=options.freezes,
-                seed=options.seed,
-            )
+        planned = options.outages(seconds)
         progress(f"{len(clients)} clients on {options.keys} keys, {len(planned)} outages, {len(bad)} faults")
         began = time.monotonic()
         frames: dict[str, int] = {}
         async with asyncio.TaskGroup() as group:
             for client in clients:
                 group.create_task(client.work(trial.keys, began + seconds, pause_s=options.pause_s))
-            group.create_task(trial.faults(planned, began))
+            group.create_task(carry_out(arena, planned, began, progress=progress))
             if wire is not None:
                 frames = await space.disturb(wire, bad, began, progress)
         result = await judge(trial, progress=progress)

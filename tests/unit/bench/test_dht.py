@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from appliance.bench.dht import live, simulation
+from appliance.bench.dht import chord, live, simulation
 from appliance.bench.dht.fleet import Fleet
 from appliance.errors import SwiftbotError
 
@@ -43,6 +43,33 @@ def test_traffic_is_counted_and_repeatable() -> None:
     assert 0 < found["rest"] < found["churn"]
     assert found["lookups_failed_percent"] < 5
     assert found == simulation.bytes_sent(60, seconds=10.0, lookups=40, seed=1)
+
+
+def test_all_parts_on_several_processes() -> None:
+    """Every size has its figures, in order, and they are those that each part counts by itself."""
+    told: list[str] = []
+    found = simulation.run((16, 40), lookups=40, seconds=3.0, seed=2, progress=told.append)
+    for part in ("hops", "join", "traffic"):
+        assert list(found[part]) == ["16", "40"]
+    assert found["failures"] == {"40": simulation.failures(40, lookups=40, seed=2)}
+    assert found["hops"]["40"] == simulation.hops(40, lookups=40, seed=2)
+    assert len(told) == 6 + len(simulation.successor_lengths(40))
+
+
+def test_parts_can_be_chosen() -> None:
+    """Only what was asked for is counted, and it is the same as among all parts."""
+    found = simulation.run((16, 40), lookups=40, seconds=3.0, seed=2, parts=("hops",), progress=lambda _: None)
+    assert {"join", "failures", "traffic", "failures_published"}.isdisjoint(found)
+    assert found["hops"]["40"] == simulation.hops(40, lookups=40, seed=2)
+
+
+def test_what_was_published_of_failures_is_the_share_of_lost_owners() -> None:
+    """Without replicas a share p of dead members loses a share p of the keys, here as in the paper; with three, p^3."""
+    found = simulation.failures(200, lookups=1500, seed=1, lengths=(16,))["successors_16"]
+    for share in (0.1, 0.3, 0.5):
+        row = found[f"{share:.0%}"]
+        assert abs(row["owner_dead_percent"] - chord.failed_percent(share)) < 6
+        assert row["all_replicas_dead_percent"] < row["owner_dead_percent"]
 
 
 def test_a_fleet_can_be_run_down_to_one() -> None:

@@ -11,6 +11,7 @@ from appliance.bench.policy import (
     cold_at,
     compare,
     in_a_fleet,
+    on_traces,
     over_gateways,
     run,
 )
@@ -72,3 +73,19 @@ def test_the_shipped_default_beside_keep_alive_in_a_fleet(monkeypatch: pytest.Mo
     line = in_a_fleet(("bursts",), (1024,), seed=1)["bursts"]["1024"]
     assert line["fewer_at_budget"] >= 30
     assert line[DEFAULT]["wasted_gb"] <= line["keep_alive"]["wasted_gb"]
+
+
+def test_points_are_means_over_several_draws() -> None:
+    """Two draws of a trace: runs add up, points are the means, and each draw's own verdict stands beside."""
+    drawn = [plain("poisson", seed=seed, rate=0.5, duration_s=1200.0) for seed in (1, 2)]
+    one, other, both = (on_traces(each, (1024,)) for each in (drawn[:1], drawn[1:], drawn))
+    assert both["runs"] == one["runs"] + other["runs"]
+    cold = [each["curves"][DEFAULT][0]["cold_percent"] for each in (one, other, both)]
+    assert cold[2] == pytest.approx((cold[0] + cold[1]) / 2, abs=0.001)
+    assert both["default_each_draw"] == one["default_each_draw"] + other["default_each_draw"]
+
+
+def test_no_draws_are_refused() -> None:
+    """None at all is an error of the one who asks."""
+    with pytest.raises(ConfigError, match="0 draws"):
+        run(traces=("poisson",), draws=0)

@@ -4,12 +4,14 @@ The scorer is loaded from beside the cases, since figures are only comparable wh
 case's roster gets every ability of the catalogue (the set names robots, not what they can do), and no site. Two
 figures stand side by side: `all`, what the tiers propose for every case whatever their confidence, and `taken`, the
 cases in which a plan was sure enough to be carried out. The second must be high, and the first minus it is what goes
-to a better tier or back to the operator.
+to a better tier or back to the operator: `curve` says what that brings. `cascade` is measured, not worked out: the same
+cases put to the real cascade with the upstream stand-in, several at a time.
 """
 
+import asyncio
 import importlib.util
-import json
 import os
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -18,14 +20,20 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
+from appliance.bench.plan.curve import UPSTREAM_MS, Answered, GoldTier, curve, gold_plan
 from appliance.errors import NotFoundError, PayloadError, PlanError
-from appliance.llm.cascade import Decomposer
+from appliance.llm.batch import everyman, prediction
+from appliance.llm.cascade import Decomposer, Slot
+from appliance.llm.routing.budget import Budget
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.model import Plan, RobotInfo
+from appliance.llm.tiers import configured
+from appliance.model import Plan, Tier
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 Progress = Callable[[str], None]
-_REPOSITORY = Path(__file__).resolve().parents[2]
+_REPOSITORY = Path(__file__).resolve().parents[3]
+AT_ONCE = 16
+"""Cases at a time that the real cascade is given: most of them wait for the stand-in."""
 FIGURES = ("decomposition", "parallel_recall", "subtask_f1", "param_f1", "exact", "domain", "valid")
 
 
@@ -49,6 +57,7 @@ async def run(
     *,
     config: LlmConfig | None = None,
     limit: int = 0,
+    upstream: bool = True,
     progress: Progress = lambda _: None,
 ) -> dict[str, Any]:
     """Plan every case and score the plans.
@@ -57,11 +66,13 @@ async def run(
         cases: JSONL file of cases, with `score.py` beside it; by default the development set.
         config: tiers to measure; by default the rules alone. Thresholds count for `taken` only.
         limit: use the first so many cases; 0 for all.
+        upstream: also put the cases to the real cascade with the upstream stand-in.
         progress: told each case whose plan is not exact.
 
     Returns:
         `all` and `taken`: percent by figure and the number of cases; `by_domain`: decomposition by domain;
-        `latency_ms`: p50 and p99; `tiers`: how often each tier's plan was used.
+        `latency_ms`: p50 and p99; `tiers`: how often each tier's plan was used; `routed_on`: the tier whose confidence
+        decides; `curve`: accuracy against share escalated, by threshold; `cascade`: the real cascade with the stand-in.
 
     Raises:
         NotFoundError: the cases or their scorer are not there.
@@ -76,6 +87,7 @@ async def run(
     asking = msgspec.structs.replace(
         wanted,
         require_implemented=False,
+        cache=0,
         local_min_confidence=0.0,
         upstream_min_confidence=0.0,
         rules_min_confidence=0.0,
@@ -88,6 +100,7 @@ async def run(
     decomposer = Decomposer(asking, catalogue)
     await decomposer.start()
     rows: list[dict[str, Any]] = []
+    answered: list[Answered] = []
     taken: list[dict[str, Any]] = []
     domains: dict[str, list[dict[str, Any]]] = {}
     latency: list[float] = []
@@ -97,6 +110,14 @@ async def run(
             plan = await _plan(decomposer, case, catalogue)
             row = score.score_case(msgspec.to_builtins(case), _prediction(plan))
             rows.append(row)
+            answered.append(
+                Answered(
+                    confidence=plan.confidence if plan is not None else 0.0,
+                    latency_ms=plan.latency_ms if plan is not None else 0.0,
+                    row=row,
+                    gold=score.score_case(msgspec.to_builtins(case), case.gold),
+                )
+            )
             domains.setdefault(str(case.gold.get("domain")), []).append(row)
             if plan is None:
                 progress(f"{case.id}: no plan")
@@ -110,37 +131,68 @@ async def run(
     finally:
         await decomposer.close()
     latency.sort()
+    first = decomposer.tiers[0] if decomposer.tiers else "none"
     return {
         "all": _average(rows),
         "taken": _average(taken),
         "by_domain": {name: _average(each)["decomposition"] for name, each in sorted(domains.items())},
         "latency_ms": {"p50": _at(latency, 0.5), "p99": _at(latency, 0.99)},
         "tiers": tiers,
+        "routed_on": f"the confidence of {first}" + (": there is no local model" if first != "local" else ""),
+        "upstream": f"gold plans after {UPSTREAM_MS:g} ms",
+        "curve": curve(answered),
+        "cascade": await _cascade(found, asking, least, catalogue, score) if upstream else None,
     }
 
 
+async def _cascade(
+    cases: Sequence[Case], config: LlmConfig, least: dict[str, float], catalogue: Catalogue, score: ModuleType
+) -> dict[str, Any]:
+    """Put all cases to the real cascade, `AT_ONCE` at a time, with an upstream that is always right after a while."""
+    base = [slot for slot in configured(config, catalogue, None, _unpaid) if slot.planner.name is not Tier.UPSTREAM]
+    slots = [msgspec.structs.replace(each, min_confidence=least[each.planner.name.value]) for each in base]
+    gold = GoldTier({case.instruction: gold_plan(case.gold) for case in cases})
+    slots.append(Slot(planner=gold, deadline_s=60.0, min_confidence=0.0, leaves_machine=True, grounded=False))
+    decomposer = Decomposer(msgspec.structs.replace(config, at_once=AT_ONCE), catalogue, slots=slots)
+    await decomposer.start()
+    turns = asyncio.Semaphore(AT_ONCE)
+
+    async def one(case: Case) -> tuple[dict[str, Any], Plan | None, float]:
+        async with turns:
+            began = time.monotonic()
+            plan = await _plan(decomposer, case, catalogue)
+            elapsed = 1000 * (time.monotonic() - began)
+        return score.score_case(msgspec.to_builtins(case), _prediction(plan)), plan, elapsed
+
+    try:
+        found = await asyncio.gather(*(one(case) for case in cases))
+    finally:
+        await decomposer.close()
+    times = sorted(elapsed for _, _, elapsed in found)
+    escalated = sum(plan is not None and plan.tier is Tier.UPSTREAM for _, plan, _ in found)
+    return {
+        "figures": _average([row for row, _, _ in found]),
+        "escalated": round(100 * escalated / max(1, len(found)), 1),
+        "thresholds": {slot.planner.name.value: slot.min_confidence for slot in slots[:-1]},
+        "latency_ms": {"p50": _at(times, 0.5), "p99": _at(times, 0.99)},
+        "planless": sum(plan is None for _, plan, _ in found),
+    }
+
+
+def _unpaid() -> tuple[Budget, Callable[[], None]]:
+    return Budget(cost=0, requests=0, price_in=0, price_out=0), lambda: None
+
+
 async def _plan(decomposer: Decomposer, case: Case, catalogue: Catalogue) -> Plan | None:
-    robots = None if case.robots is None else tuple(_robot(name, catalogue) for name in case.robots)
+    robots = None if case.robots is None else tuple(everyman(name, catalogue) for name in case.robots)
     try:
         return (await decomposer.plan(PlanContext(instruction=case.instruction, robots=robots))).plan
     except PlanError:
         return None
 
 
-def _robot(name: str, catalogue: Catalogue) -> RobotInfo:
-    uses = tuple(sorted({use for skill in catalogue.skills.values() for use in skill.uses}))
-    verbs = tuple(sorted({verb for skill in catalogue.skills.values() for verb in skill.verbs}))
-    return RobotInfo(id=name, kind="zenoh", uses=uses, verbs=verbs, flies=True)
-
-
 def _prediction(plan: Plan | None) -> dict[str, Any]:
-    if plan is None:
-        return {}
-    subtasks = [
-        {"id": each.id, "skill": each.skill, "robot": each.robot, "params": each.params, "after": list(each.after)}
-        for each in plan.subtasks
-    ]
-    return {"domain": plan.domain, "subtasks": subtasks}
+    return {} if plan is None else prediction("", plan)
 
 
 def _average(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -179,10 +231,3 @@ def _scorer(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-if __name__ == "__main__":
-    import asyncio
-    import sys
-
-    print(json.dumps(asyncio.run(run(progress=lambda text: print(text, file=sys.stderr))), indent=1))

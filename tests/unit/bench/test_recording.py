@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.bench.record import run
+from appliance.bench.recording.writing import run
 
 pytestmark = pytest.mark.anyio
 
