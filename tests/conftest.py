@@ -17,7 +17,8 @@ import pytest
 from hypothesis import settings
 
 # Found examples are printed, not kept: no run depends on an earlier one, and the tree may be read-only.
-settings.register_profile("alone", database=None)
+# No deadlines: how long an example takes says how busy the machine is.
+settings.register_profile("alone", database=None, deadline=None)
 settings.load_profile("alone")
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from fleets import RULES
 
 from appliance import config as configuration
 from appliance import local_fleet
@@ -141,7 +142,7 @@ def write_skills(folder: Path) -> Path:
 @asynccontextmanager
 async def fleet_of(
     folder: Path, *, gateways: int = 3, pool: PoolConfig | None = None, migration: MigrationConfig | None = None,
-    pools: dict[str, PoolConfig] | None = None, drain_s: float = 20.0, rovers: int = 0,
+    pools: dict[str, PoolConfig] | None = None, drain_s: float = 20.0, rovers: int = 0, sim_rate: float = 1.0,
 ) -> AsyncIterator[FleetState]:  # fmt: skip
     """A fleet that knows these skills, with so many rovers; ended and cleaned up afterwards."""
     order = Order(
@@ -150,10 +151,12 @@ async def fleet_of(
         gateways=gateways,
         mavlink=0,
         zenoh=rovers,
+        sim_rate=sim_rate,
         pool=pool or PoolConfig(floor={"base": 1}),
         pools=pools or {},
         base=GatewayConfig(
             id="gw-1",
+            llm=RULES,
             skills=(str(write_skills(folder)),),
             drain_s=drain_s,
             tasks=TasksConfig(migration=migration or MigrationConfig()),

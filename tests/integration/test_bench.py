@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from appliance.bench import actors, federated, migrate, pooled, rate, refill, soak, startup, transfer, zygote
+from appliance.bench import actors, federated, migrate, overload, pooled, rate, refill, soak, startup, transfer, zygote
 from appliance.pool.engine import PodmanEngine
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
@@ -173,10 +173,25 @@ async def test_transfer(built: None) -> None:
 @pytest.mark.fleet
 async def test_migrate(built: None) -> None:
     """Moves with checkpoints and with a volume, each step's time, and the alternative; all of them start there."""
-    result = await migrate.run(2, 1, 1, 1, overload=False, progress=lambda _: None)
+    result = await migrate.run(2, 1, 1, 1, part="moves", progress=lambda _: None)
     for name in ("move, checkpoint 1 kB", "move, checkpoint 256 kB"):
         assert result[name]["took"]["count"] == 2
         assert result[name]["took"]["p99"] is not None, result
         assert {"step find", "step hold", "step write", "step start"} <= set(result[name])
     assert result["move, volume 1 MB"]["took"]["max"] is not None, result
     assert result["end, start anew cold"]["count"] == 1
+
+
+@pytest.mark.fleet
+async def test_overload(built: None) -> None:
+    """Only with moves on are runs moved, none twice; without, what may run on one gateway alone waits for long runs."""
+    load = overload.Options(runs=4, work_s=0.5, long_s=15.0, short=4, short_s=0.2)
+    result = (await migrate.run(load=load, part="overload", progress=lambda _: None))["overload"]
+    assert result["crowd, moves off"]["moves"] == result["held, moves off"]["moves"] == 0
+    assert result["crowd, moves on"]["most moves of a run"] <= 1
+    on, off = result["held, moves on"], result["held, moves off"]
+    assert on["moves"] >= 1
+    assert on["most moves of a run"] == 1
+    assert on["queue_wait"]["count"] == off["queue_wait"]["count"] == 4
+    # Without moves the first of them begins when a long run has ended.
+    assert off["queue_wait"]["p50"] > 10_000, result

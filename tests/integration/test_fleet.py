@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
+from fleets import PLAIN, RULES
 from pymavlink import mavutil
 
 from appliance import config as configuration
@@ -41,6 +42,7 @@ FETCH = "Rover_1: go to dock 3, pick the red box, then go to dock 2 and place th
 async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
     """Three gateways, a recorder and two robots as processes; ended and cleaned up afterwards."""
     order = Order(
+        base=PLAIN,
         fleet=f"t{os.getpid()}-{time.monotonic_ns() % 100000}",
         directory=tmp_path / "fleet",
         sim_rate=4.0,
@@ -86,7 +88,7 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
         sim_rate=4.0,
         zenoh=0,
         pool=PoolConfig(floor={"base": 1}),
-        base=GatewayConfig(id="gw-1", robots=RobotsConfig(templates=(template,))),
+        base=GatewayConfig(id="gw-1", llm=RULES, robots=RobotsConfig(templates=(template,))),
     )
     state = await local_fleet.up(order, progress=print, timeout_s=90.0)
 
@@ -121,7 +123,7 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
         assert answers[1] == answers[2] == (0, task_number(task))
         async with FleetClient(state.endpoint) as client:
             record = await client.task(task)
-        assert (record.instruction, record.submitter) == ("drone_1: take off, then land", "drone_1")
+        assert (record.instruction, record.submitter) == ("drone_1: take off, then land", "mavlink-255-190")
         assert record.state is TaskState.SUCCEEDED
     finally:
         await local_fleet.down(order.directory, progress=print)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fleets import RULES
 from msgspec.structs import replace
 
 from appliance import local_fleet
@@ -110,7 +111,7 @@ async def up(tmp_path: Path, skills: Path) -> AsyncIterator[Up]:
             gateways=gateways,
             mavlink=0,
             zenoh=0,
-            base=GatewayConfig(id="base", skills=(str(skills),)),
+            base=GatewayConfig(id="base", llm=RULES, skills=(str(skills),)),
             **more,
         )
         return await local_fleet.up(order, progress=print, timeout_s=120.0)

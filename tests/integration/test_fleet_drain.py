@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from fleets import PLAIN
 
 from appliance import local_fleet
 from appliance.client import FleetClient
@@ -25,6 +26,7 @@ FETCH = "Rover_1: go to dock 3, pick the red box, then go to dock 2 and place th
 async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
     """Three gateways, a recorder and a robot as processes; ended and cleaned up afterwards."""
     order = Order(
+        base=PLAIN,
         fleet=f"d{os.getpid()}-{time.monotonic_ns() % 100000}",
         directory=tmp_path / "fleet",
         mavlink=0,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fleets import RULES
 
 from appliance import local_fleet
 from appliance.client import FleetClient
@@ -75,7 +76,7 @@ async def up(tmp_path: Path) -> AsyncIterator[Up]:
             gateways=gateways,
             mavlink=0,
             zenoh=0,
-            base=GatewayConfig(id="base", skills=(str(tmp_path / "skills"),)),
+            base=GatewayConfig(id="base", llm=RULES, skills=(str(tmp_path / "skills"),)),
             **more,
         )
         return await local_fleet.up(order, progress=print, timeout_s=180.0)

@@ -201,7 +201,7 @@ async def follow(client: FleetClient, task: str, *, until: Callable[[TaskRecord]
         async for record in changes:
             if until(record):
                 return record
-    raise AssertionError("the task ended before that")
+    raise AssertionError(f"the task ended before that: {record.state} {record.failure}")
 
 
 async def end(client: FleetClient, task: str) -> TaskRecord:
@@ -270,7 +270,7 @@ async def test_work_that_goes_wrong_is_found_and_mended(up: Up, upstream: Upstre
         assert record.subtasks[0].result is not None
         assert record.subtasks[0].result["note"] == "kept"
 
-        accepted = await client.submit(TaskRequest(instruction="do the work"))
+        accepted = await client.submit(TaskRequest(instruction="begin, then on with it, otherwise as you can"))
         begun = await follow(
             client,
             accepted.id,

@@ -11,9 +11,13 @@ from pathlib import Path
 import pytest
 
 from appliance.errors import DeadlineError, PlanError, PrerequisiteError
+from appliance.llm import speaking
+from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import MAX_WORDS
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.slot import Slot
+from appliance.llm.speaking import Question
 from appliance.llm.validate import validate
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
@@ -83,6 +87,42 @@ async def test_the_same_again_is_the_same(tier: LocalTier) -> None:
         except PlanError as error:
             answers.append(error.message)
     assert answers[0] == answers[2]
+
+
+def test_the_likeliest_whole_answer_is_given(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is likeliest step by step is among the answers, each different; it is no surer than the one given."""
+    speaker = Slot(folder).speaker
+    assert speaker is not None
+    for instruction in INSTRUCTIONS[:2]:
+        question = Question(text=instruction, robots=("rover_1", "drone_1"), skills=shapes(CATALOGUE), deadline_s=60.0)
+        monkeypatch.setattr(speaking, "TURNS", 0)
+        step_by_step = speaker.answer(question)
+        monkeypatch.setattr(speaking, "TURNS", 12)
+        monkeypatch.setattr(speaking, "FAIR", 0.0)
+        monkeypatch.setattr(speaking, "LONGER", 100)
+        said = speaker.answer(question)
+        answers = [said.symbols, *(each.symbols for each in said.others)]
+        sure = [said.confidence, *(each.confidence for each in said.others)]
+        assert not step_by_step.others
+        assert len(set(answers)) == len(answers) > 4
+        assert step_by_step.symbols in answers
+        assert sure == sorted(sure, reverse=True)
+        assert said.confidence >= step_by_step.confidence
+
+
+def test_a_generator_that_was_set_back_says_the_same(folder: Path) -> None:
+    """The library's own promise, which another try rests on: after a rewind, as if the rest had never been said."""
+    speaker = Slot(folder).speaker
+    assert speaker is not None
+    prompt = speaker._prompt(["go", "home", "now"], 3)
+    fresh, again = speaker._new(), speaker._new()
+    fresh.append_tokens([*prompt, 5])
+    again.append_tokens(prompt)
+    again.append_tokens([7])
+    again.append_tokens([9])
+    again.rewind_to(len(prompt))
+    again.append_tokens([5])
+    assert abs(fresh.get_logits() - again.get_logits()).max() < 1e-4
 
 
 async def test_too_many_words_and_too_little_time(folder: Path) -> None:

@@ -1,5 +1,6 @@
 """The upstream tier against real HTTP servers: what works, and every way in which a server can misbehave."""
 
+import asyncio
 import json
 import threading
 import time
@@ -113,7 +114,8 @@ def server() -> Iterator[Server]:
 
 def config(server: Server, **more: Any) -> LlmConfig:
     """Return a configuration that points at the server."""
-    return LlmConfig(**{"upstream_url": server.url, "upstream_model": "big", "upstream_deadline_s": 5.0, **more})
+    given = {"local_model": "", "upstream_url": server.url, "upstream_model": "big", "upstream_deadline_s": 5.0}
+    return LlmConfig(**given | more)
 
 
 async def ask(server: Server, **more: Any) -> Any:
@@ -325,7 +327,7 @@ async def test_the_rest_of_a_task_is_planned_anew(server: Server) -> None:
     assert [each.skill for each in outcome.plan.subtasks] == ["goto", "record_video"]
     told = server.asked[0]["messages"][-1]["content"]
     assert 'Done: {"id":"s1","skill":"goto"' in told
-    assert "because: the camera is dirty" in told
+    assert 'because: "the camera is dirty"' in told
     assert "this has failed (the camera is dirty)" in server.asked[1]["messages"][-1]["content"]
 
 
@@ -352,3 +354,111 @@ async def test_without_a_model_rules_use_alternatives_or_say_that_they_cannot(se
         assert any("s2 (goto) has failed and no alternative" in each for each in refused.value.problems)
     finally:
         await cascade.close()
+
+
+# --- cost, offline, keys --------------------------------------------------------------------------------------------
+
+
+async def test_the_days_budget_is_kept(server: Server) -> None:
+    """What an answer cost is counted by its usage and the prices; when the day's budget is spent nothing is sent."""
+    paid = {"usage": {"prompt_tokens": 1000, "completion_tokens": 100}}
+    status, body = completion(PLAN)
+    server.answers = [(status, json.dumps({**json.loads(body), **paid}).encode())]
+    prices = {"upstream_price_in": 1.0, "upstream_price_out": 5.0}
+    settings = config(server, tiers=("upstream", "rules"), upstream_budget=0.003, cache=0, **prices)
+    cascade = Decomposer(replace(settings, require_implemented=False), CATALOGUE)
+    try:
+        plans = [(await cascade.plan(ASK)).plan for _ in range(3)]
+        outcome = await cascade.plan(ASK)
+    finally:
+        await cascade.close()
+    assert [each.tier for each in plans] == [Tier.UPSTREAM, Tier.UPSTREAM, Tier.RULES]
+    assert "budget is used up" in outcome.attempts[0].problems[0]
+    assert len(server.asked) == 2
+    upstream = cascade.status.upstream
+    assert upstream is not None
+    assert (upstream.requests, upstream.spent, upstream.budget) == (2, 0.003, 0.003)
+
+
+async def test_a_server_that_is_away_is_left_alone(server: Server) -> None:
+    """Offline is normal: after three failures in a row nothing is sent for a while, and the rules answer at once."""
+    server.answers = [(503, b"down")]
+    settings = config(server, tiers=("upstream", "rules"), upstream_retries=0, require_implemented=False, cache=0)
+    cascade = Decomposer(settings, CATALOGUE)
+    try:
+        outcomes = [await cascade.plan(ASK) for _ in range(6)]
+    finally:
+        await cascade.close()
+    assert all(each.plan.tier is Tier.RULES for each in outcomes)
+    assert len(server.asked) == 3
+    assert "left alone" in outcomes[-1].attempts[0].problems[0]
+    upstream = cascade.status.upstream
+    assert upstream is not None
+    assert upstream.state == "open"
+    assert upstream.retry_after_s > 0
+
+
+async def test_a_server_that_is_back_is_asked_again(server: Server) -> None:
+    """After the pause one question is let through, and its answer closes the breaker."""
+    server.answers = [(503, b"down"), (503, b"down"), (503, b"down"), completion(PLAN)]
+    settings = config(
+        server,
+        tiers=("upstream", "rules"),
+        upstream_retries=0,
+        upstream_open_s=0.05,
+        require_implemented=False,
+        cache=0,
+    )
+    cascade = Decomposer(settings, CATALOGUE)
+    try:
+        for _ in range(3):
+            await cascade.plan(ASK)
+        while (await cascade.plan(ASK)).plan.tier is not Tier.UPSTREAM:
+            await asyncio.sleep(0.02)
+    finally:
+        await cascade.close()
+    upstream = cascade.status.upstream
+    assert upstream is not None
+    assert upstream.state == "closed"
+
+
+async def test_where_the_key_comes_from(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file first, then the service's credential, then the environment; without any, none is sent."""
+    server.answers = [completion(PLAN)]
+    monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
+    monkeypatch.delenv("SWIFTBOT_UPSTREAM_KEY", raising=False)
+    await ask(server)
+    monkeypatch.setenv("SWIFTBOT_UPSTREAM_KEY", "of-environment")
+    await ask(server)
+    (tmp_path / "swiftbot-upstream-key").write_text("of-service\n")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    await ask(server)
+    (tmp_path / "file").write_text("of-file")
+    await ask(server, upstream_key_file=str(tmp_path / "file"))
+    (tmp_path / "swiftbot-upstream-key").write_text("two words")
+    with pytest.raises(ConfigError, match="credential swiftbot-upstream-key does not hold a key"):
+        await ask(server)
+    assert server.keys == [None, "Bearer of-environment", "Bearer of-service", "Bearer of-file"]
+
+
+async def test_private_robots_are_not_told_of(server: Server) -> None:
+    """A robot whose id matches is in no prompt, and an order that names it goes nowhere."""
+    server.answers = [completion(PLAN)]
+    settings = config(
+        server, tiers=("upstream", "rules"), upstream_never_robots=("nurse_*",), require_implemented=False, cache=0
+    )
+    uses = tuple(sorted({use for skill in CATALOGUE.skills.values() for use in skill.uses}))
+    verbs = tuple(sorted({verb for skill in CATALOGUE.skills.values() for verb in skill.verbs}))
+    roster = tuple(RobotInfo(id=each, kind="zenoh", uses=uses, verbs=verbs) for each in ("rover_1", "nurse_1"))
+    cascade = Decomposer(settings, CATALOGUE)
+    try:
+        assert (await cascade.plan(replace(ASK, robots=roster))).plan.tier is Tier.UPSTREAM
+        named = PlanContext(instruction="Nurse_1: go to dock 1", robots=roster)
+        assert (await cascade.plan(named)).plan.tier is Tier.RULES
+    finally:
+        await cascade.close()
+    assert len(server.asked) == 1
+    assert "nurse_1" not in json.dumps(server.asked[0]["messages"][-1])
+    upstream = cascade.status.upstream
+    assert upstream is not None
+    assert upstream.withheld == 1

@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from fleets import RULES
 from moving_bench import counting, ended, pretty, write_skills
 
 from appliance import config as configuration
@@ -128,6 +129,7 @@ async def halves(folder: Path) -> AsyncIterator[tuple[Relay, FleetClient, FleetC
             config = GatewayConfig(
                 id=name,
                 fleet=fleet,
+                llm=RULES,
                 data_dir=str(folder / name),
                 skills=(str(skills),),
                 drain_s=1.0,

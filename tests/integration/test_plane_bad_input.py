@@ -68,11 +68,11 @@ async def test_two_fleets_on_one_network_do_not_meet(tmp_path: Path, free_ports:
 async def test_a_clock_that_is_an_hour_off(tmp_path: Path, free_ports: Callable[..., list[int]], hours: int) -> None:
     """Facts stamped an hour ahead or behind are believed all the same, later ones replace them, and writes go on."""
     async with _planes(tmp_path, free_ports(2), "f") as (one, other):
-        off = Session(other.config, "f", one.session._raw, asyncio.get_running_loop())
+        off = Session(other.config, "f", one.session._wire.raw, asyncio.get_running_loop())
         when = dt.datetime.now(dt.UTC) + dt.timedelta(hours=hours)
-        stamp = zenoh.Timestamp(when, one.session._raw.new_timestamp().get_id())
+        stamp = zenoh.Timestamp(when, one.session._wire.raw.new_timestamp().get_id())
         status = GatewayStatus(id="g0", fleet="f", load=0.25)
-        off._raw.put(off.keys.status("g0"), encode(status), timestamp=stamp)
+        off._wire.raw.put(off.keys.status("g0"), encode(status), timestamp=stamp)
         await _until(lambda: "g0" in other.registry.gateways)
         one.registry.publish_status(GatewayStatus(id="g0", fleet="f", load=0.75))
         await _until(lambda: other.registry.gateways["g0"].load == 0.75)

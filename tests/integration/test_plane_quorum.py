@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -190,7 +191,7 @@ async def test_a_plain_record_may_be_read_with_a_quorum(fleet: Fleet) -> None:
 async def test_who_cannot_vote_says_why(fleet: Fleet) -> None:
     """Other voters than configured, ballots that would use up the numbers, records of another key: refused, counted."""
     one, two, _ = fleet.planes.values()
-    digest = one._voting._digest
+    digest = one._voting.voter.digest
     call = one.rpc.call
     with pytest.raises(RefusedError, match="other voters"):
         await call("g1", "quorum_vote", VoteAsk(key="k", voters="0"), Voted)
@@ -250,3 +251,49 @@ async def test_who_lost_its_promises_does_not_vote(fleet: Fleet) -> None:
     again = await fleet.start(2)
     with pytest.raises(UnreachableError):
         await again.dht.read("task/1", quorum=True)
+
+
+async def test_removed_registers_are_forgotten_when_all_agree(fleet: Fleet) -> None:
+    """No row of a removed key is left once its time has passed and every voter has it; while one is away all keep it.
+
+    The key can be written again, and what its voters forgot outlives a restart.
+    """
+    planes = fleet.planes
+    version = await planes[0].dht.write("lock/1", b"1", expected=None, quorum=True)
+    await planes[0].dht.write("lock/2", b"2", expected=None, quorum=True)
+    await fleet.stop(2)
+    await planes[0].dht.remove("lock/1", expected=version, quorum=True)
+    late = time.time_ns() + 10**9
+    for _ in range(3):
+        for plane in planes.values():
+            assert await plane._forgetting.forget(late) == 0
+    await fleet.start(2)
+
+    async def rows() -> set[str]:
+        found = [await plane.store.scan("quorum") for plane in planes.values()]
+        return {key for each in found for key, _ in each if key not in ("quorum-floor", "quorum/lock/2")}
+
+    assert await planes[0]._forgetting.forget(0) == 0
+    async with asyncio.timeout(60):
+        while await rows():
+            for plane in planes.values():
+                await plane._forgetting.forget(time.time_ns() + 10**9)
+            await asyncio.sleep(0.05)
+    assert await planes[1].dht.read("lock/1", quorum=True) is None
+    for number in (0, 1, 2):
+        await fleet.stop(number)
+        await fleet.start(number)
+    late_accept = AcceptAsk(
+        key="lock/1", ballot=Ballot(1, "g0:late"), voters=planes[0]._voting.voter.digest,
+        record=Record(key="lock/1", value=b"1", version={"g0": 1}),
+    )  # fmt: skip
+    for number in (0, 1, 2):
+        told = await planes[0].rpc.call(f"g{number}", "quorum_accept", late_accept, Voted)
+        assert not told.granted
+    assert await planes[0].dht.read("lock/1", quorum=True) is None
+    await planes[2].dht.write("lock/1", b"again", expected=None, quorum=True)
+    for plane in planes.values():
+        assert await plane._forgetting.forget(late + 10**12) == 0
+        record = await plane.dht.read("lock/1", quorum=True)
+        assert record is not None
+        assert record.value == b"again"

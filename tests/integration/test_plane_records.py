@@ -6,11 +6,13 @@ import os
 import random
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
 from appliance.errors import ConfigError, ConflictError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane.messages import Found, StoreAsk
 from appliance.plane.node import STORE_FILE, Plane
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
@@ -86,6 +88,21 @@ async def _fleet_of(folder: Path, ports: list[int], **settings: float) -> AsyncI
     finally:
         for number in list(made.planes):
             await made.stop(number)
+
+
+async def test_the_rest_of_a_start_waits_until_the_shard_is_compared(fleet: Fleet) -> None:
+    """A gateway that was restarted is back once it answers for its keys; whoever waits for that may give up."""
+    key = fleet.owned_by(1)
+    await fleet.planes[0].dht.write(key, b"kept", expected=None)
+    await fleet.stop(1)
+    plane = await fleet.start(1)
+    assert not await plane.until_back(0.0)
+    assert await plane.until_back(60.0)
+    assert plane.dht.reconciled()
+    assert plane.milestones["reconciled"] >= plane.milestones["joined"]
+    found = await plane.dht.read(key)
+    assert found is not None
+    assert found.value == b"kept"
 
 
 async def test_a_record_is_written_once_and_read_anywhere(fleet: Fleet) -> None:
@@ -363,6 +380,8 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
         "dht_digest": [{"asker": "A/*"}],
         "facts": [],
         "member": [{"gateway": "A/*"}],
+        "records": [{"prefix": "x" * 600}, {"after": "x" * 600}, {"limit": 0}, {"limit": 10**9}],
+        "record_place": [{"key": ""}],
     }
     assert verbs == sorted(impossible)
     for verb in verbs:
@@ -375,7 +394,7 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
                 await foreign.query(key, msgspec.json.encode(body), timeout_s=5)
         oversize = b"x" * (plane.config.max_payload_bytes + 1)
         answers = await asyncio.to_thread(
-            lambda key=key, oversize=oversize: list(foreign._raw.get(key, payload=oversize, timeout=10))
+            lambda key=key, oversize=oversize: list(foreign._wire.raw.get(key, payload=oversize, timeout=10))
         )
         assert b'"payload"' in answers[0].err.payload.to_bytes()
         assert plane.session.refused[f"malformed gw/g0/rpc/{verb}"] >= 6
@@ -383,6 +402,37 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
     await foreign.close()
     key = fleet.owned_by(0)
     assert await fleet.planes[1].dht.write(key, b"still works", expected=None)
+
+
+async def test_a_request_waits_until_whoever_has_come_back_was_compared_with(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that was away may have ordered writes meanwhile: the owner answers for what they share when it has them."""
+    one, other = fleet.planes[0], fleet.planes[1]
+    key = next(key for at in range(10_000) if one.ring.successors(key := f"task/{at}", 2) == ("g0", "g1"))
+    version = await one.dht.write(key, b"before", expected=None)
+    membership, comparing, token = one._membership, one._reconciler._comparing, one.keys.alive("g1")
+    membership._seen(token, alive=False)
+    while not one.dht.reconciled():
+        await asyncio.sleep(0.01)
+    held, compare = asyncio.Event(), comparing.compare
+
+    async def slow(*asked: Any, **more: Any) -> Any:
+        await held.wait()
+        return await compare(*asked, **more)
+
+    monkeypatch.setattr(comparing, "compare", slow)
+    newer = Record(key=key, value=b"meanwhile", version={**version, "g1": 1}, write="w")
+    await other.rpc.call("g1", "dht_store", StoreAsk(newer), Found)
+    membership._seen(token, alive=True)
+    reading = asyncio.create_task(one.dht.read(key))
+    await asyncio.sleep(0.2)
+    assert not reading.done()
+    held.set()
+    record = await reading
+    assert record is not None
+    assert record.value == b"meanwhile"
+    assert not one.dht.returned
 
 
 async def test_a_write_meant_for_another_is_refused(fleet: Fleet) -> None:

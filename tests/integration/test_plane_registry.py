@@ -13,6 +13,7 @@ from appliance.errors import UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
 from appliance.plane import registry
 from appliance.plane.node import Plane, PlaneClient
+from appliance.plane.registry import Registry
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
@@ -28,12 +29,14 @@ async def _until(condition: Callable[[], object]) -> None:
 
 @pytest.fixture
 async def two(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncIterator[tuple[Plane, Plane]]:
-    """Two gateways that see each other."""
+    """Two gateways that see each other, and have asked each other for what was told before."""
     endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(2)]
     one = await Plane.open(PlaneConfig(listen=(endpoints[0],)), fleet="f", gateway="g0", data_dir=tmp_path / "g0")
     config = PlaneConfig(listen=(endpoints[1],), connect=(endpoints[0],))
     other = await Plane.open(config, fleet="f", gateway="g1", data_dir=tmp_path / "g1")
     await _until(lambda: len(one.members()) == len(other.members()) == 2)
+    for each in (one, other):
+        await each.registry.wait_for_facts()
     yield one, other
     await one.close()
     await other.close()
@@ -160,9 +163,9 @@ async def test_malformed_and_oversize_facts(two: tuple[Plane, Plane]) -> None:
     size = other.config.max_payload_bytes + 1
     for key, misplaced in topics.values():
         for payload in (b"", b"{", b"\xff", b"[]", b"[" * 50_000, misplaced, b"x" * size):
-            foreign._raw.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+            foreign._wire.raw.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
     foreign.put(keys.status("stranger"), encode(GatewayStatus(id="stranger", fleet="f")))
-    bad_token = foreign._raw.liveliness().declare_token(f"{keys.root}/gw/NOT A NAME/alive")
+    bad_token = foreign._wire.raw.liveliness().declare_token(f"{keys.root}/gw/NOT A NAME/alive")
     await _until(
         lambda: all(
             other.session.refused.get(f"{how} {topic}", 0) == count
@@ -243,6 +246,37 @@ async def test_a_newcomer_asks_one_for_all(
         client = await PlaneClient.open(_client(planes[0]), fleet="f")
         stack.push_async_callback(client.close)
         assert set(client.registry.gateways) == {f"g{number}" for number in range(5)}
+
+
+async def test_containers_told_before_a_newcomer_listened_are_asked_for(
+    tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A status that comes before the answer for all does not hide that its gateway has told its containers earlier."""
+    monkeypatch.setattr(registry, "FEW", 1)
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(4)]
+    async with contextlib.AsyncExitStack() as stack:
+        planes: list[Plane] = []
+        for number, endpoint in enumerate(endpoints[:3]):
+            config = PlaneConfig(listen=(endpoint,), connect=tuple(endpoints[:number]))
+            plane = await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=tmp_path / f"g{number}")
+            stack.push_async_callback(plane.close)
+            planes.append(plane)
+        await _until(lambda: all(len(each.members()) == 3 for each in planes))
+        status = GatewayStatus(id="g2", fleet="f", containers=2)
+        planes[2].registry.publish_containers((_container("g2", "a"), _container("g2", "b")))
+        planes[2].registry.publish_status(status)
+        await _until(lambda: all(len(each.registry.containers.get("g2", {})) == 2 for each in planes))
+        take = Registry._take_others
+
+        def late_answer(self: Registry, others: Any) -> None:
+            self._on_status("swiftbot/f/gw/g2/status", status)  # what was heard on the way is newer than the answer
+            take(self, others)
+
+        monkeypatch.setattr(Registry, "_take_others", late_answer)
+        config = PlaneConfig(listen=(endpoints[3],), connect=tuple(endpoints[:3]))
+        late = await Plane.open(config, fleet="f", gateway="g3", data_dir=tmp_path / "g3")
+        stack.push_async_callback(late.close)
+        await _until(lambda: set(late.registry.containers.get("g2", {})) == {"a", "b"})
 
 
 async def test_a_client_of_an_empty_fleet_says_so(two: tuple[Plane, Plane]) -> None:

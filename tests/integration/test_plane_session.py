@@ -93,7 +93,7 @@ async def test_bad_facts_are_counted_and_dropped(pair: tuple[Session, Session]) 
     bad = [b"", b"{", b"\xff\xfe", b"[]", b'{"at_ns": "x"}', b"null", b"[" * 100_000]
     for payload in (good, *bad, good):
         one.put(key, payload)
-    one._raw.put(key, b"x" * (LIMIT + 1))  # a foreign client keeps to no limit
+    one._wire.raw.put(key, b"x" * (LIMIT + 1))  # a foreign client keeps to no limit
     one.delete(key)
     await _until(lambda: len(seen) == 3)
     assert [value is None for _, value in seen] == [False, False, True]
@@ -126,10 +126,10 @@ async def test_a_flood_is_bounded_and_counted(free_port: int) -> None:
     await _heard(other, one)
     for _ in range(5000):
         other.put("swiftbot/f/x", b"x" * 100)
-    while other._outbox._waiting:
+    while other._wire.outbox._waiting:
         time.sleep(0.01)  # noqa: ASYNC251 - the loop must not turn: it is what is overrun here
     time.sleep(0.2)  # noqa: ASYNC251
-    assert len(one._inbox._waiting) == 100
+    assert len(one._wire.inbox._waiting) == 100
     await _until(lambda: one.refused.get("incoming queue full", 0) + len(seen) == 5000)
     seen.clear()
     other.put("swiftbot/f/x", b"after")
@@ -205,7 +205,7 @@ async def test_bad_requests_are_answered_with_the_reason(pair: tuple[Session, Se
     for payload in bad:
         with pytest.raises(PayloadError, match="not a Need"):
             await one.query(key, payload, timeout_s=5)
-    foreign = await asyncio.to_thread(lambda: list(one._raw.get(key, payload=b"x" * (LIMIT + 1), timeout=5)))
+    foreign = await asyncio.to_thread(lambda: list(one._wire.raw.get(key, payload=b"x" * (LIMIT + 1), timeout=5)))
     assert len(foreign) == 1
     assert foreign[0].err is not None
     assert msgspec.json.decode(foreign[0].err.payload.to_bytes(), type=ErrorReply).code == "payload"
@@ -227,7 +227,7 @@ async def test_a_question_for_another_key_is_refused(pair: tuple[Session, Sessio
     other.serve(key, handle)
     await _heard(one, other)
     wrong = one.keys.command("rover_4").encode()
-    foreign = await asyncio.to_thread(lambda: list(one._raw.get(key, payload=b"x", attachment=wrong, timeout=5)))
+    foreign = await asyncio.to_thread(lambda: list(one._wire.raw.get(key, payload=b"x", attachment=wrong, timeout=5)))
     assert foreign[0].err is not None
     assert msgspec.json.decode(foreign[0].err.payload.to_bytes(), type=ErrorReply).code == "unreachable"
     assert reached == []
@@ -237,7 +237,7 @@ async def test_a_question_for_another_key_is_refused(pair: tuple[Session, Sessio
         while not reached:
             with contextlib.suppress(UnreachableError):
                 assert await one.query(key, b"x", timeout_s=5) == b"x"
-    plain = await asyncio.to_thread(lambda: list(one._raw.get(key, payload=b"x", timeout=5)))
+    plain = await asyncio.to_thread(lambda: list(one._wire.raw.get(key, payload=b"x", timeout=5)))
     assert plain[0].ok is not None
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -136,13 +137,19 @@ async def test_a_flight(open_yard: Open) -> None:
     assert result["mode"] == "AUTO"
     assert (await yard.done("land"))["landed"] is True
     state = await yard.done("state")
-    assert (state["flies"], state["armed"], state["uses"]) == (True, False, ["base"])
+    assert (state["flies"], state["armed"], state["uses"]) == (True, False, ["base", "speaker"])
     assert [each.verb for each in yard.commanded] == ["arm", "takeoff", "goto", "land"]
     info = yard.infos[-1]
-    assert (info.id, info.kind, info.gateway, info.flies, info.uses) == ("drone_1", "mavlink", "gw-1", True, ("base",))
+    assert (info.id, info.kind, info.gateway, info.flies, info.uses) == (
+        "drone_1",
+        "mavlink",
+        "gw-1",
+        True,
+        ("base", "speaker"),
+    )
     assert info.battery_percent is not None
     # The raw frames of both directions are on the plane, whole.
-    for direction, sender in (("rx", 1), ("tx", 245)):
+    for direction, sender in (("rx", 1), ("tx", 242)):
         frames = [each for data in yard.frames[direction] for each in Codec(9, 9).read(data)]
         assert frames
         assert {each.system for each in frames} == {sender}  # pyright: ignore[reportAttributeAccessIssue]
@@ -286,7 +293,10 @@ async def test_cancelling_the_caller_stops_the_vehicle(open_yard: Open) -> None:
 
 
 async def test_a_killed_vehicle_goes_offline_and_comes_back(open_yard: Open) -> None:
-    """Without heartbeats the command under way fails as retryable and the token goes; a new process is taken back."""
+    """Without heartbeats the command under way fails as retryable and the token goes; a new process is taken back.
+
+    Meanwhile it cannot be stopped either, and nobody says that it was.
+    """
     yard = await open_yard(heartbeat_lost_s=1.5)
     process = await yard.vehicle(rate=1.0)
     going = asyncio.create_task(yard.tell("goto", waypoints=[{"x": 200, "y": 4}]))
@@ -298,6 +308,9 @@ async def test_a_killed_vehicle_goes_offline_and_comes_back(open_yard: Open) -> 
     assert "offline" in failure.message
     await until(lambda: not yard.infos[-1].online)
     await until(lambda: yard.alive == [True, False])
+    stopped = await yard.tell("stop")
+    assert stopped.failure is not None
+    assert "could not be told to hold: it is offline, and was armed" in stopped.failure.message
     refused = await yard.tell("arm")
     assert refused.failure is not None
     assert refused.failure.retryable
@@ -404,3 +417,28 @@ async def test_a_restarted_gateway_resumes_the_flight(free_port: int, free_udp_p
         await client.close()
         await store.close()
         await session.close()
+
+
+async def test_a_vehicle_is_moved_by_hand_and_holds_by_itself(open_yard: Open) -> None:
+    """On the ground it is refused with the remedy; in the air it moves while it is told so, then stays where it is."""
+    yard = await open_yard()
+    await yard.vehicle(rate=2.0)
+    refused = await yard.tell("velocity", forward_mps=1.0)
+    assert refused.failure is not None
+    assert "takeoff" in refused.failure.remedy
+    await yard.done("takeoff", altitude_m=6.0)
+    before = (await yard.done("state"))["pose"]
+    for _ in range(3):
+        moved = await yard.done("velocity", forward_mps=2.0, for_s=0.5)
+    assert (moved["pose"]["x"], moved["pose"]["y"]) != (before["x"], before["y"])
+    async with asyncio.timeout(20):
+        last = (await yard.done("state"))["pose"]
+        while (now := (await yard.done("state"))["pose"]) != last or math.dist(xy(now), xy(before)) < 0.5:
+            last = now
+            await asyncio.sleep(0.5)
+    assert now["z"] == pytest.approx(before["z"], abs=1.0)
+
+
+def xy(pose: dict[str, float]) -> tuple[float, float]:
+    """Return where it is on the map."""
+    return (pose["x"], pose["y"])

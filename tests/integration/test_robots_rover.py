@@ -15,7 +15,21 @@ import pytest
 from PIL import Image
 
 from appliance.errors import PayloadError, UnreachableError
-from appliance.model import Box, Place, RobotCommand, RobotInfo, RobotReply, Site, SiteObject, TaskRequest, encode
+from appliance.model import (
+    Box,
+    Device,
+    Door,
+    Enquiry,
+    Person,
+    Place,
+    RobotCommand,
+    RobotInfo,
+    RobotReply,
+    Site,
+    SiteObject,
+    TaskRequest,
+    encode,
+)
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.robots import commands
@@ -64,7 +78,7 @@ class Hall:
     async def rover(self, name: str, **settings: Any) -> asyncio.subprocess.Process:
         """Start a rover and wait until it is on the roster."""
         order = RobotSettings(
-            name=name, fleet="hall", connect=(self.endpoint,), site=SITE, **({"rate": 10.0} | settings)
+            name=name, fleet="hall", connect=(self.endpoint,), **({"rate": 10.0, "site": SITE} | settings)
         )
         process = await asyncio.create_subprocess_exec(sys.executable, "-c", _PROCESS, encode(order).decode())
         self.processes.append(process)
@@ -119,7 +133,11 @@ async def test_fetching_a_box(hall: Hall) -> None:
     """Drive, photograph, pick, carry, place: each does what it says, and what is impossible says why."""
     await hall.rover("rover_1")
     info = hall.infos["rover_1"]
-    assert (info.kind, info.uses, info.gateway) == ("zenoh", ("base", "arm", "camera"), "")
+    assert (info.kind, info.uses, info.gateway) == (
+        "zenoh",
+        ("base", "arm", "camera", "speaker", "microphone"),
+        "",
+    )
     failure = (await hall.tell("rover_1", "pick", object="red box")).failure
     assert failure is not None
     assert (failure.message, failure.remedy) == (
@@ -216,6 +234,65 @@ async def test_two_rovers_share_their_world(hall: Hall) -> None:
             await asyncio.sleep(0.05)
 
 
+async def test_doors_devices_and_people(hall: Hall) -> None:
+    """A shut door is in the way until it is opened, a light is switched, a person is asked and given a box."""
+    site = Site(
+        places={"charger": Place(x=0.0, y=0.0), "office": Place(x=8.0, y=0.0)},
+        objects=(SiteObject(name="red box", colour="red", at="charger"),),
+        doors=(Door(name="office door", x=(4.0, 4.2), y=(-50.0, 50.0)),),
+        devices=(Device(name="light", at="office"),),
+        people=(Person(name="Ann", at="office", answers={"box": "give it to me"}),),
+    )
+    await hall.rover("rover_1", site=site)
+    await hall.done("rover_1", "pick", object="red box")
+    into = {"waypoints": [{"x": 7, "y": 0}]}
+    failure = (await hall.tell("rover_1", "goto", **into)).failure
+    assert failure is not None
+    assert failure.message == "the leg to waypoint 1 goes through the shut office door"
+    await hall.done("rover_1", "goto", waypoints=[{"x": 3, "y": 0}])
+    assert (await hall.done("rover_1", "open", object="office door")).result["changed"] is True
+    assert (await hall.done("rover_1", "open", object="office door")).result["changed"] is False
+    await hall.done("rover_1", "goto", **into)
+    assert (await hall.done("rover_1", "switch_on", object="light")).result["state"] == "on"
+    asked = (await hall.done("rover_1", "ask", question="Where does the box go?", to="Ann")).result
+    assert (asked["answer"], asked["by"]) == ("give it to me", "Ann")
+    assert (await hall.done("rover_1", "say", text="here you are")).result["heard_by"] == ["Ann"]
+    assert (await hall.done("rover_1", "give", object="red box", to="Ann")).result["to"] == "Ann"
+    await until(lambda: hall.infos["rover_1"].holding == "")
+
+
+async def test_people_answer_what_a_skill_asks_through_a_robot(hall: Hall) -> None:
+    """A question that a gateway puts for people is heard by the robot it goes through, and a person near it answers."""
+    site = Site(
+        places={"charger": Place(x=0.0, y=0.0)},
+        people=(Person(name="Ann", at="charger", answers={"door": "it is open"}),),
+    )
+    answers: list[dict[str, Any]] = []
+
+    async def answer(key: str, payload: bytes) -> bytes:
+        answers.append(json.loads(payload))
+        return b"{}"
+
+    hall.session.serve(hall.session.keys.rpc("gw-1", "answer"), answer)
+    hall.session.declare_alive(hall.session.keys.alive("gw-1"))
+    await hall.rover("rover_1", site=site)
+    asked = Enquiry(id="t:s:1", question="Is the door open?", to="Ann", robot="rover_1")
+    for enquiry in (
+        asked,
+        msgspec.structs.replace(asked, id="t:s:2", robot="rover_2"),
+        msgspec.structs.replace(asked, id="t:s:3", question="What time is it?"),
+        msgspec.structs.replace(asked, id="t:s:4", answer="yes"),
+    ):
+        hall.session.put(hall.session.keys.enquiry(enquiry.id), encode(enquiry))
+    async with asyncio.timeout(30):
+        while not answers:
+            hall.session.put(hall.session.keys.enquiry(asked.id), encode(asked))
+            await asyncio.sleep(0.1)
+    await asyncio.sleep(1.0)
+    assert [(each["id"], each["answer"], each["by"]) for each in answers] == [("t:s:1", "it is open", "Ann")]
+    assert answers[0]["act"]
+
+
 async def test_bad_input_is_answered(hall: Hall) -> None:
     """Malformed commands and world changes are refused and the rover goes on."""
     await hall.rover("rover_1")
@@ -227,7 +304,7 @@ async def test_bad_input_is_answered(hall: Hall) -> None:
         hall.session.put(hall.session.keys.world("red_box"), payload)
     failure = (await hall.tell("rover_1", "teleport")).failure
     assert failure is not None
-    assert "it can: capture, goto" in failure.remedy
+    assert "it can: ask, capture, close, give, goto" in failure.remedy
     await hall.done("rover_1", "state")
 
 

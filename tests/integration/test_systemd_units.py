@@ -10,13 +10,19 @@ import pytest
 
 from appliance.config import load
 
-UNITS = ("swiftbot-gateway.service", "swiftbot-recorder.service", "swiftbot-router.service")
+UNITS = (
+    "swiftbot-gateway.service",
+    "swiftbot-recorder.service",
+    "swiftbot-router.service",
+    "swiftbot-foxglove.service",
+)
 MOST_EXPOSURE = 2.0
 """What `systemd-analyze security` may say; 10 is no hardening at all."""
 INSTALLED = (
     "usr/local/lib/systemd/system/swiftbot-gateway.service",
     "usr/local/lib/systemd/system/swiftbot-recorder.service",
     "usr/local/lib/systemd/system/swiftbot-router.service",
+    "usr/local/lib/systemd/system/swiftbot-foxglove.service",
     "usr/local/lib/systemd/system-generators/swiftbot-generator",
     "usr/local/lib/sysusers.d/swiftbot.conf",
     "usr/local/lib/tmpfiles.d/swiftbot.conf",

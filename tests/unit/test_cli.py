@@ -10,10 +10,13 @@ COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "task watch",
     "task why", "task agree", "fleet",
     "pool", "robots list", "robots qgc-actions", "log info", "log replay", "log recover",
-    "log merge", "log trim", "log cat", "log pin", "sim mavlink", "sim zenoh", "images build", "images list",
-    "images fetch", "doctor", "tui", "bench startup", "bench rate", "bench refill", "bench soak", "bench zygote",
+    "log merge", "log trim", "log cat", "log pin", "log check", "log trigger",
+    "sim mavlink", "sim zenoh", "images build", "images list",
+    "images fetch", "doctor", "tui", "bench tui",
+    "bench startup", "bench rate", "bench refill", "bench soak", "bench zygote",
     "bench transfer",
     "bench table", "pool list", "pool why", "pool warm", "pool evict", "pool release", "pool decisions",
+    "plane get", "plane put", "plane rm", "plane ls",
 ]  # fmt: skip
 
 
@@ -44,6 +47,12 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         (["log", "info", "{tmp}/none.mcap"], 4, "none.mcap"),
         (["log", "replay", "{tmp}/none.mcap"], 4, "none.mcap"),
         (["gateway", "--config", "{tmp}/none.toml"], 2, "none.toml"),
+        (["plane", "get", "k", "--quorum", "--replica"], 2, "exclude"),
+        (["plane", "put", "k", "v", "--new", "--expect", "{{}}"], 2, "exclude"),
+        (["plane", "put", "k", "v", "--stdin"], 2, "leave all but one out"),
+        (["plane", "put", "k", "--file", "{tmp}/none"], 4, "none"),
+        (["plane", "ls", "--limit", "0"], 2, "1 to 1,000"),
+        (["plane", "ls", "--connect", "tcp/127.0.0.1:1"], 3, "tcp/127.0.0.1:1"),
         (["bench", "rate", "--rates", "0"], 2, "above 0"),
         (["bench", "table", "{tmp}/none.json"], 4, "none.json"),
         (["sim", "mavlink", "--to", "nowhere"], 2, "nowhere"),

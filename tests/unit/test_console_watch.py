@@ -43,5 +43,5 @@ def test_revisions_say_what_failed_and_what_was_done() -> None:
     assert "revision 1 (skill): r1_1 (find) takes the place" in text
     assert "since s2 failed: saw nothing" in text
     assert "out: s2 (detect) failed; in: r1_1" in text
-    assert "swiftbot task agree t" in text
+    assert "swiftbot task approve t" in text
     assert "s1 goto rover_1" in text

@@ -14,6 +14,7 @@ from appliance.doctor.checks import local_checks
 from appliance.doctor.containers import podman_checks
 from appliance.doctor.machine import FileFacts
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
+from appliance.llm.settings import LlmConfig
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import ContainerSpec, Engine, EngineFacts, Found, FoundImage
@@ -233,6 +234,7 @@ def test_ports_of_the_configuration_are_tried() -> None:
         id="gw-1",
         plane=PlaneConfig(listen=("tcp/0.0.0.0:7447",)),
         robots=RobotsConfig(mavlink=(MavlinkLink(listen="udp://127.0.0.1:14550"),)),
+        llm=LlmConfig(local_model=""),
     )
     machine = FakeMachine()
     assert failed(local_checks(machine, config)) == {}

@@ -1,5 +1,7 @@
 """The bounded queue between the event loop and the writer thread."""
 
+import threading
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -38,3 +40,19 @@ def test_losses_by_reason() -> None:
     intake.lose("too large", Drop(1, 5, "b", 2))
     assert intake.take(0)[1] == {"too large": Drop(3, 15, "b", 2)}
     assert intake.take(0)[1] == {}
+
+
+def test_a_burst_waits_for_room_and_a_stuck_writer_costs_messages() -> None:
+    """A batch waits until the writer has taken what is there; when it does not, batches are dropped and counted."""
+    intake = Intake(messages=5, payload_bytes=1000)
+    intake.put_all([_message(1)] * 4)
+    taker = threading.Timer(0.05, lambda: intake.take(0))
+    taker.start()
+    intake.put_all([_message(2)] * 4)
+    taker.join()
+    assert [len(each.payload) for each in intake.take(0)[0]] == [2] * 4
+    for _ in range(20):  # with a wait each this would take ten seconds
+        intake.put_all([_message(1)] * 4)
+    out, drops = intake.take(0)
+    assert len(out) == 5
+    assert drops["queue full"].count == 75

@@ -8,10 +8,20 @@ import pytest
 from appliance.model import LogLine, Notice, TaskRecord, encode
 from appliance.plane.keys import Keys
 from appliance.record.facts import LoggedMessage
+from appliance.record.foxglove import LOG_KIND, Foxglove
 from appliance.record.schemas import KeySchemas, flat_schema
 
 KEYS = Keys("f1")
 SCHEMAS = KeySchemas(KEYS)
+
+
+def _log_of(message: LoggedMessage) -> bytes | None:
+    """Return what the log panel is given of a message."""
+    derive = Foxglove(KEYS, "rec").deriving(message.key)
+    assert derive is not None
+    made = derive(message)
+    assert all(each.kind is LOG_KIND and each.topic == KEYS.recorder_log("rec") for each in made)
+    return made[0].payload if made else None
 
 
 @pytest.mark.parametrize(
@@ -26,6 +36,9 @@ SCHEMAS = KeySchemas(KEYS)
         (KEYS.commanded("r1"), "swiftbot.RobotCommand", "json"),
         (KEYS.camera("r1"), "foxglove.CompressedImage", "json"),
         (KEYS.mavlink("r1", "rx"), "", "mavlink"),
+        (KEYS.link_frames("g1", "udp-1", "tx"), "", "mavlink"),
+        (KEYS.act("g1"), "swiftbot.Act", "json"),
+        (KEYS.soft_stop("a1"), "swiftbot.SoftStop", "json"),
         (KEYS.intake("r1"), "swiftbot.TaskRequest", "json"),
         (KEYS.notice("ops"), "swiftbot.Notice", "json"),
         (KEYS.recorder_status("rec"), "swiftbot.RecorderStatus", "json"),
@@ -84,7 +97,7 @@ def test_nested_structs_are_inlined() -> None:
 def test_log_lines_become_foxglove_log() -> None:
     """A log line goes to the log panel with its level, time and fields; a malformed one does not."""
     line = LogLine(at_ns=1_500_000_000, level="warning", source="pool", event="container died", fields={"id": "c1"})
-    made = SCHEMAS.as_foxglove_log(LoggedMessage(KEYS.log("g1"), 1, encode(line)))
+    made = _log_of(LoggedMessage(KEYS.log("g1"), 1, encode(line)))
     assert made is not None
     assert msgspec.json.decode(made) == {
         "timestamp": {"sec": 1, "nsec": 500_000_000},
@@ -94,12 +107,12 @@ def test_log_lines_become_foxglove_log() -> None:
         "file": "",
         "line": 0,
     }
-    assert SCHEMAS.as_foxglove_log(LoggedMessage(KEYS.log("g1"), 1, b"{")) is None
+    assert _log_of(LoggedMessage(KEYS.log("g1"), 1, b"{")) is None
 
 
 def test_notices_become_foxglove_log() -> None:
     """A notice to a person is in the log panel too, at its arrival when it has no time of its own."""
-    made = SCHEMAS.as_foxglove_log(LoggedMessage(KEYS.notice("ops"), 7, encode(Notice(id="n", to="ops", text="done"))))
+    made = _log_of(LoggedMessage(KEYS.notice("ops"), 7, encode(Notice(id="n", to="ops", text="done"))))
     assert made is not None
     decoded = msgspec.json.decode(made)
     assert decoded["message"] == "to ops: done"

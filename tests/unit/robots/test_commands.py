@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PayloadError, RobotError, UnreachableError
 from appliance.model import Failure, RobotCommand, RobotReply, encode
@@ -34,6 +35,8 @@ class Robot:
         self.halts = 0
         self.gate = asyncio.Event()
         self.problem: RobotFailure | None = None
+        self.stopped = ""
+        self.lease = "l"
         self.session = session
         self.refused: dict[str, int] = {}
         self.ledger = Ledger("r", store)
@@ -50,6 +53,7 @@ class Robot:
             ready=self.ready,
             halt=self.halt,
             refused=self.refused,
+            gate=lambda _, command: "" if command.lease == self.lease else self.stopped,
         )
 
     def act(self, name: str) -> Any:
@@ -124,6 +128,22 @@ async def test_a_busy_actuator_is_refused_as_retryable(robot: Robot) -> None:
     assert (await robot.desk.execute(order("t/s1/2"))).failure is None
 
 
+async def test_a_robot_that_may_not_be_commanded_takes_nothing_up(robot: Robot) -> None:
+    """The refusal says who and why, and that it is worth asking again; stopping works, and the lease's own commands."""
+    robot.gate.set()
+    robot.stopped = "stopped by ann: a person"
+    reply = await robot.desk.execute(order("t/s1/1"))
+    assert reply.failure is not None
+    assert reply.failure.retryable
+    assert "stopped by ann: a person" in reply.failure.message
+    assert robot.done == []
+    assert (await robot.desk.execute(order("t/s1/2", verb="stop"))).failure is None
+    assert (await robot.desk.execute(replace(order("by-hand"), lease="l"))).failure is None
+    robot.stopped = ""
+    assert (await robot.desk.execute(order("t/s1/1"))).failure is None
+    assert robot.done == ["goto", "goto"]
+
+
 async def test_hold_ends_what_the_base_does(robot: Robot) -> None:
     """A hold is done at once, and the goto under way is answered as cancelled."""
     going = await robot.begin(order("t/s1/1"))
@@ -179,7 +199,24 @@ async def test_bad_commands_say_what_is_wrong(robot: Robot, command: RobotComman
     assert robot.session.commanded() == []
 
 
-@pytest.mark.parametrize("payload", [b"", b"{", b"[1]", b'{"verb": "goto"}', b'{"id": "", "verb": "goto"}', b"\xff"])
+BOMB = b'{"a":' * 6000 + b"1" + b"}" * 6000
+"""Nested deeper than anybody reads."""
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{",
+        b"[1]",
+        b'{"verb": "goto"}',
+        b'{"id": "", "verb": "goto"}',
+        b"\xff",
+        b'{"id": "\xff", "verb": "goto"}',
+        b'{"id": "1", "verb": "goto", "args": ' + BOMB + b"}",
+        b'{"id": "1", "verb": "goto", "attempt": ' + b"9" * 6000 + b"}",
+    ],
+)
 async def test_what_is_no_command_is_a_payload_error(robot: Robot, payload: bytes) -> None:
     """Malformed queries are counted and answered as PayloadError."""
     with pytest.raises(PayloadError):
@@ -268,11 +305,12 @@ async def test_nobody_answers(session: Any, monkeypatch: pytest.MonkeyPatch) -> 
         await send_command(session, "r", order("t/s1/1"), timeout_s=60.0)
 
 
-async def test_an_answer_that_is_none(session: Any) -> None:
+@pytest.mark.parametrize("told", [b"hello", b'{"id": "\xff"}', b'{"id": "1", "result": ' + BOMB + b"}"])
+async def test_an_answer_that_is_none(told: bytes, session: Any) -> None:
     """Bytes that are no RobotReply are a RobotError."""
 
     async def answer(payload: bytes) -> bytes:
-        return b"hello"
+        return told
 
     session.answer = answer
     with pytest.raises(RobotError):

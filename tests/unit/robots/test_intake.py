@@ -4,6 +4,7 @@ import msgspec
 import pytest
 
 from appliance.errors import PayloadError
+from appliance.model import Plan, Provenance
 from appliance.plane.session import Message
 from appliance.robots.intake import MAX_BYTES, read_request
 
@@ -22,10 +23,18 @@ def test_a_request_gets_an_id_and_its_submitter() -> None:
     assert one.id == same.id != later.id
 
 
-def test_a_given_id_and_submitter_are_kept() -> None:
-    """What the robot says about its request stands."""
+def test_a_given_id_is_kept_and_another_submitter_is_not() -> None:
+    """A robot that names somebody else does not get his turns or what he may have done."""
     _, request = read_request(message(b'{"instruction": "go", "id": "mine", "submitter": "ana"}'))
-    assert (request.id, request.submitter) == ("mine", "ana")
+    assert (request.id, request.submitter) == ("mine", "rover_1")
+
+
+def test_where_a_plan_came_from_is_not_the_robots_to_say() -> None:
+    """Provenance that a robot puts into its plan is taken out: it would get into the cache of plans made here."""
+    plan = Plan(domain="navigation", subtasks=(), provenance=Provenance(tier="rules", confidence=1.0))
+    _, request = read_request(message(msgspec.json.encode({"instruction": "go", "plan": plan})))
+    assert request.plan is not None
+    assert request.plan.provenance is None
 
 
 @pytest.mark.parametrize(
@@ -39,6 +48,11 @@ def test_a_given_id_and_submitter_are_kept() -> None:
         b'{"instruction": "go", "unknown": 1}',
         b'{"instruction": "go", "id": "../../etc"}',
         b"\xff\xfe",
+        b'{"instruction": "go", "plan": ' + b'{"a":' * 6000 + b"1" + b"}" * 6001,
+        b'{"instruction": ' + b"[" * 60_000,
+        b'{"instruction": "go", "priority": ' + b"9" * 60_000 + b"}",
+        b'{"instruction": "go", "deadline_s": 1e999}',
+        b'{"instruction": "go", "id": "' + b"x" * 60_000 + b'"}',
         msgspec.json.encode({"instruction": "x" * 5000}),
         msgspec.json.encode({"instruction": "x" * MAX_BYTES}),
     ],

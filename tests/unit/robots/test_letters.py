@@ -28,7 +28,7 @@ class Air:
         self.submitted: Counter[str] = Counter()
         self.error: SwiftbotError | None = None
         self.refused: dict[str, int] = {}
-        doors = Tasks(submit=self.submit, cancel=self.look, look=self.look) if tasks else None
+        doors = Tasks(submit=self.submit, cancel=lambda task, _: self.look(task), look=self.look) if tasks else None
         self.desk = LetterDesk(tasks=doors, refused=self.refused, clock=lambda: self.now)
         self.robot = Channel(itertools.count(7).__next__)
         self.codec, self.reader = Codec(1, 192), Codec(245, 191)
@@ -83,7 +83,7 @@ class Air:
         for payload in self.robot.due(self.now):
             self._send(self.up, payload)
         for payload in self._land(self.up):
-            self.desk.take(self.frame(payload), robot="drone_1", reply=self.reply)
+            self.desk.take(self.frame(payload), asker="drone_1", reply=self.reply)
         self.desk.tick()
         for payload in self._land(self.down):
             whole = self.robot.take(payload, self.now)
@@ -164,9 +164,9 @@ async def test_payloads_that_are_none() -> None:
     """Truncated, foreign and oversize payloads are counted, and many senders cost no more memory than some."""
     air = Air()
     for payload in (b"", b"SB", b"XX\x01\x01" + bytes(12), b"SB\x01\x09" + bytes(12)):
-        air.desk.take(air.frame(payload), robot="", reply=air.reply)
+        air.desk.take(air.frame(payload), reply=air.reply)
     assert air.refused["tunnel_malformed"] >= 3
     for system in range(1, 200):
         air.codec = Codec(system, 1)
-        air.desk.take(air.frame(b""), robot="", reply=air.reply)
+        air.desk.take(air.frame(b""), reply=air.reply)
     assert len(air.desk._senders) == 64

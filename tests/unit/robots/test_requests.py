@@ -31,6 +31,7 @@ class Fleet:
         self.store = store
         self.submitted: list[TaskRequest] = []
         self.cancelled: list[str] = []
+        self.by: list[str] = []
         self.error: SwiftbotError | None = None
         self.gate = asyncio.Event()
         self.gate.set()
@@ -40,7 +41,7 @@ class Fleet:
 
     def new_desk(self) -> RequestDesk:
         """Return a desk on the same store, as after a restart."""
-        tasks = Tasks(submit=self.submit, cancel=self.cancel, look=self.cancel)
+        tasks = Tasks(submit=self.submit, cancel=self.cancel_by, look=self.cancel)
         return RequestDesk(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
@@ -51,13 +52,24 @@ class Fleet:
         self.submitted.append(request)
         return TaskRecord(id=request.id, instruction=request.instruction)
 
+    async def cancel_by(self, task: str, by: str) -> TaskRecord:
+        """Cancel a task for somebody."""
+        self.by.append(by)
+        return await self.cancel(task)
+
     async def cancel(self, task: str) -> TaskRecord:
         """Cancel a task."""
         self.cancelled.append(task)
         return TaskRecord(id=task, instruction="", state=TaskState.CANCELLING)
 
     def send(
-        self, *, robot: str = "drone_1", name: str = "COMMAND_LONG", source: tuple[int, int] = (255, 190), **fields: Any
+        self,
+        *,
+        robot: str = "drone_1",
+        asker: str = "",
+        name: str = "COMMAND_LONG",
+        source: tuple[int, int] = (255, 190),
+        **fields: Any,
     ) -> None:
         """Send a command."""
         numbers = {f"param{number}": 0.0 for number in range(1, 8)}
@@ -69,7 +81,7 @@ class Fleet:
         common = {"target_system": 1, "target_component": 191, "command": 31010}
         (frame,) = Codec(245, 191).read(Codec(*source).pack(make(name, **(common | numbers | fields))))
         assert isinstance(frame, Frame)
-        self.desk.take(frame, robot=robot, reply=self.said.append)
+        self.desk.take(frame, robot=robot, asker=asker, reply=self.said.append)
 
     @property
     def acks(self) -> list[tuple[int, int]]:
@@ -101,8 +113,20 @@ async def test_a_button_makes_a_task(fleet: Fleet) -> None:
     fleet.send(param1=1.0)
     await fleet.answered(2)
     (request,) = fleet.submitted
-    assert (request.instruction, request.submitter) == ("drone_1 photograph the gate", "drone_1")
+    assert (request.instruction, request.submitter) == ("drone_1 photograph the gate", "mavlink-255-190")
     assert fleet.acks == [(IN_PROGRESS, 0), (ACCEPTED, task_number(request.id))]
+
+
+async def test_a_task_is_of_whoever_sent_the_command(fleet: Fleet) -> None:
+    """A vehicle's task is its own; one that addresses another vehicle asks about that and not as that."""
+    fleet.send(param1=1.0, source=(1, 1), robot="drone_1", asker="drone_1")
+    await fleet.answered(2)
+    fleet.send(param1=1.0, source=(2, 1), robot="drone_1", asker="drone_2")
+    await fleet.answered(4)
+    assert [(each.instruction, each.submitter) for each in fleet.submitted] == [
+        ("drone_1 photograph the gate", "drone_1"),
+        ("drone_1 photograph the gate", "drone_2"),
+    ]
 
 
 async def test_arguments_are_filled_in(fleet: Fleet) -> None:
@@ -199,6 +223,7 @@ async def test_cancelling(fleet: Fleet) -> None:
     fleet.send(command=31011)
     await fleet.answered(5)
     assert fleet.cancelled == [fleet.submitted[0].id]
+    assert fleet.by == ["mavlink-255-190"]
     assert fleet.acks[-1] == (ACCEPTED, task_number(fleet.submitted[0].id))
 
 

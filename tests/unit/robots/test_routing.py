@@ -94,3 +94,46 @@ def test_in_a_ring_of_routers_a_frame_ends(path: list[int], start: int) -> None:
             sent[at] += 1
             on_the_way.append(((at + (1 if end.link else -1)) % 6, 1 - end.link))
         assert sum(sent) <= 12
+
+
+def test_senders_age_apart_from_their_end() -> None:
+    """A vehicle that fell silent behind a router that still speaks is forgotten; the router's others are not."""
+    made = router()
+    made.hear(passage(2, 1), DRONE, 10.0)
+    for now in (30.0, 59.0, 69.0):
+        made.hear(passage(1, 1), DRONE, now)
+        made.hear(passage(255, 190), GCS, now)
+    made.hear(passage(1, 1), DRONE, 70.5)
+    assert made.destinations(passage(255, to=2, part=1), GCS) == ()
+    assert made.destinations(passage(255, to=1, part=1), GCS) == (DRONE,)
+
+
+def test_a_fast_sender_may_say_the_same_again() -> None:
+    """The same bytes after 128 frames of their sender are news, as its numbers wrapped; before they are not."""
+    made = Router((Rules(),), own_system=OWN)
+    assert not made.repeated(b"beat", 0.0, sender=(1, 1))
+    for number in range(127):
+        assert not made.repeated(b"%d" % number, 0.001, sender=(1, 1))
+    assert made.repeated(b"beat", 0.002, sender=(1, 1)) is False
+    assert made.repeated(b"beat", 0.003, sender=(1, 1)) is True
+
+
+def test_links_come_and_go() -> None:
+    """Frames reach a link that was added, by its rules, and no end of one that was removed."""
+    made, late = router(), End(7, ("late", 1))
+    made.add(7, Rules(not_out=frozenset({"ATTITUDE"})))
+    made.hear(passage(3, 1), late, 1.0)
+    assert late in made.destinations(passage(1, name="HEARTBEAT"), DRONE)
+    assert late not in made.destinations(passage(1, name="ATTITUDE"), DRONE)
+    made.remove(7)
+    assert late not in made.destinations(passage(1, name="HEARTBEAT"), DRONE)
+    assert made.destinations(passage(255, to=3, part=1), GCS) == ()
+    assert made.destinations(passage(3, name="HEARTBEAT"), late) == ()
+
+
+def test_invented_ids_cost_no_memory() -> None:
+    """However many senders somebody makes up, routes stay bounded."""
+    made = router()
+    for number in range(10_000):
+        made.hear(passage(number % 256, number // 256), DRONE, 0.0)
+    assert len(made.routes) <= 2048

@@ -45,6 +45,32 @@ def test_a_signed_frame_is_taken_once() -> None:
     assert [kind(reader, raw) for raw in (first, first, second, first)] == ["", "replayed", "", "replayed"]
 
 
+@given(
+    st.lists(
+        st.one_of(
+            st.tuples(st.just("heard"), st.integers(0, 1), st.integers(0, 7)),
+            st.tuples(st.just("restarted"), st.just(0), st.just(0)),
+        ),
+        max_size=40,
+    )
+)
+def test_no_frame_is_believed_twice(events: list[tuple[str, int, int]]) -> None:
+    """Recorded, repeated, out of order, over restarts: of each stream only ever newer frames; its next one is heard."""
+    senders = [codec(system=1), codec(system=2)]
+    recorded = [[sender.pack(make("HEARTBEAT", **BEAT)) for _ in range(8)] for sender in senders]
+    reader = codec(system=245)
+    newest = [-1, -1]
+    for what, stream, number in events:
+        if what == "restarted":
+            assert reader.signer is not None
+            reader = codec(system=245, memory=reader.signer.memory)
+        else:
+            taken = kind(reader, recorded[stream][number]) == ""
+            assert taken == (number > newest[stream])
+            newest[stream] = max(newest[stream], number)
+    assert all(kind(reader, sender.pack(make("HEARTBEAT", **BEAT))) == "" for sender in senders)
+
+
 def test_pymavlink_agrees() -> None:
     """Pymavlink believes what is signed here, and what it signs is believed here."""
     theirs = ardupilotmega.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -159,3 +185,29 @@ def test_a_key_from_systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     (tmp_path / "mavlink").chmod(0o400)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     assert read_key("credential:mavlink") == KEY
+
+
+@given(seconds=st.integers(0, 4), crashes=st.integers(1, 5))
+def test_a_crash_uses_no_time_twice(seconds: int, crashes: int) -> None:
+    """What was kept up to five seconds ago is enough, with a clock that went back: own times rise, old frames are old.
+
+    And a vehicle that is heard for the first time after all those crashes is not shut out.
+    """
+    sender, clock, memory, before = codec(), Clock(), Memory(), b""
+    clock.now = NOW
+    for _ in range(crashes):
+        reader = codec(system=245, memory=memory, clock=clock)
+        assert reader.signer is not None
+        assert kind(reader, sender.pack(make("HEARTBEAT", **BEAT))) == ""
+        memory = reader.signer.ahead
+        clock.now += seconds * 100_000
+        heard = sender.pack(make("HEARTBEAT", **BEAT))
+        assert kind(reader, heard) == ""
+        mine = reader.pack(make("HEARTBEAT", **BEAT))[-12:-6][::-1]
+        assert mine > before
+        before = mine
+        clock.now = NOW - 1000
+        again = codec(system=245, memory=memory, clock=clock)
+        assert kind(again, heard) == "replayed"
+        sender._clock.now += 10 * 100_000  # pyright: ignore[reportFunctionMemberAccess]
+    assert kind(codec(system=245, memory=memory, clock=clock), codec(system=9).pack(make("HEARTBEAT", **BEAT))) == ""

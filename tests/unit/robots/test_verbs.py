@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from appliance.model import Box, Pose, Site
-from appliance.robots.verbs import GotoArgs, RobotFailure, Waypoint, check_way, cruise, parse_args
+from appliance.robots.policy import check_way
+from appliance.robots.verbs import GotoArgs, RobotFailure, Waypoint, cruise, parse_args
 
 SITE = Site(
     obstacles=(Box(name="rack", x=(4.0, 6.0), y=(-1.0, 1.0)),),

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.model import Box, Place, Pose, Site, SiteObject
-from appliance.robots.geo import inside
-from appliance.robots.sim.world import REACH_M, World, aim
+from appliance.model import Box, Device, Door, Person, Place, Pose, Site, SiteObject
+from appliance.model.geo import inside
+from appliance.robots.sim.world import REACH_M, World, aim, answer
 from appliance.robots.verbs import RobotFailure
 
 SITE = Site(
@@ -107,6 +107,70 @@ def test_copies_that_hear_all_changes_in_any_order_end_equal(actions: list[tuple
     for change in reversed(changes):
         worlds["b"].take_in(change)
     assert worlds["a"].things == worlds["b"].things
+
+
+LIVELY = Site(
+    places={"hall": Place(x=0.0, y=0.0), "office": Place(x=20.0, y=0.0)},
+    objects=(SiteObject(name="red box", colour="red", at="hall"),),
+    doors=(Door(name="office door", x=(10.0, 10.2), y=(-1.0, 1.0)),),
+    devices=(Device(name="hall light", at="hall"),),
+    people=(
+        Person(name="Ann", at="hall", answers={"": "I am busy", "key": "on the shelf", "red key": "with Bob"}),
+        Person(name="Bob", at="office"),
+    ),
+)
+IN_HALL, AT_DOOR = Pose(x=0.0, y=0.0), Pose(x=9.0, y=0.0)
+
+
+def test_a_shut_door_is_in_the_way_until_somebody_opens_it() -> None:
+    """It is turned from within reach, from both sides; other copies follow; it cannot be picked."""
+    world, other = World(LIVELY), World(LIVELY)
+    assert [box.name for box in world.shut] == ["the shut office door"]
+    with pytest.raises(RobotFailure, match=r"office door is 10\.0 m away"):
+        world.check_switch("office door", IN_HALL, states=("open", "closed"))
+    for pose in (AT_DOOR, Pose(x=11.0, y=0.0)):
+        assert world.check_switch("the door", pose, states=("open", "closed")).name == "office door"
+    assert other.take_in(world.switch("r", world.check_switch("door", AT_DOOR, states=("open", "closed")), "open"))
+    assert world.shut == other.shut == ()
+    with pytest.raises(RobotFailure, match="to be picked"):
+        world.check_pick("r", "office door", AT_DOOR)
+
+
+def test_devices_are_switched_and_doors_are_not() -> None:
+    """A light has another pair of states than a door: the wrong order names what there is."""
+    world = World(LIVELY)
+    light = world.check_switch("light", IN_HALL, states=("on", "off"))
+    assert world.switch("r", light, "on").state == "on"
+    with pytest.raises(RobotFailure, match="no 'office door' here for that") as caught:
+        world.check_switch("office door", AT_DOOR, states=("on", "off"))
+    assert caught.value.failure.remedy == "there are: hall light"
+
+
+def test_people_near_enough_are_found_and_answer() -> None:
+    """The nearest, or the one named; too far and unknown people are told; the fullest match of a question counts."""
+    world = World(LIVELY)
+    ann = world.person("", IN_HALL)
+    assert ann.name == "Ann"
+    assert answer(ann, "Where is the key?") == "on the shelf"
+    assert answer(ann, "Where is the RED key, please?") == "with Bob"
+    assert answer(ann, "What time is it?") == "I am busy"
+    assert answer(world.person("bob", Pose(x=18.0, y=0.0)), "Well?") == ""
+    with pytest.raises(RobotFailure, match=r"Bob is 20\.0 m away"):
+        world.person("Bob", IN_HALL)
+    with pytest.raises(RobotFailure, match="no 'Cleo' about"):
+        world.person("Cleo", IN_HALL)
+
+
+def test_giving_needs_the_thing_and_the_person() -> None:
+    """What is given is the person's, and cannot be picked any more."""
+    world = World(LIVELY)
+    with pytest.raises(RobotFailure, match="holds nothing"):
+        world.check_give("r", "red box", "Ann", IN_HALL)
+    world.pick("r", world.check_pick("r", "red box", IN_HALL))
+    world.give("r", *world.check_give("r", "red box", "Ann", IN_HALL))
+    assert world.held_by("r") is None
+    with pytest.raises(RobotFailure, match="held by Ann"):
+        world.check_pick("r", "red box", IN_HALL)
 
 
 def test_where_the_camera_looks() -> None:

@@ -24,7 +24,7 @@ class Wire:
         return SimpleNamespace(undeclare=lambda: None)
 
 
-@pytest.mark.parametrize("noise", [b"", b"[]", b"{", b"{}", b"null"])
+@pytest.mark.parametrize("noise", [b"", b"[]", b"{", b"{}", b"null", b"\xff", b"[" * 100_000])
 def test_following_skips_what_is_no_record(noise: bytes) -> None:
     """Malformed and empty payloads between a task's records are passed over; old ones are not told again."""
     records = [

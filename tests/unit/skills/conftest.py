@@ -4,7 +4,7 @@ import hashlib
 import importlib.util
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,6 +23,10 @@ class Fail(Exception):  # noqa: N818 - the runner's name for it
     def __init__(self, message: str, remedy: str = "", retryable: bool = False) -> None:
         super().__init__(message)
         self.message, self.remedy, self.retryable = message, remedy, retryable
+
+
+class Moved(BaseException):
+    """A run is left where it is: its next attempt is made elsewhere."""
 
 
 class FakeContext:
@@ -46,10 +50,15 @@ class FakeContext:
         self.picture = draw()
         self.commands: list[tuple[str, dict[str, Any]]] = []
         self.notices: list[tuple[str, str]] = []
+        self.questions: list[tuple[str, str]] = []
+        self.said = "yes"
         self.files: dict[str, bytes] = {}
         self.steps: list[tuple[float, str]] = []
         self.logged: list[str] = []
         self.partials: list[dict[str, Any]] = []
+        self.checkpoints: list[dict[str, Any]] = []
+        self.interrupt_after = 0
+        self.resume: dict[str, Any] | None = None
         self.answers: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
@@ -78,6 +87,13 @@ class FakeContext:
         self.notices.append((to, text))
         return {"notice": f"t1/s1/{len(self.notices)}"}
 
+    def ask(self, question: str, choices: Sequence[str] = (), to: str = "operator", timeout_s: float = 240) -> str:
+        """Note the question, and answer as the test says."""
+        assert timeout_s > 0
+        self.questions.append((to, question))
+        assert not choices or self.said in choices
+        return self.said
+
     def put_artifact(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> dict[str, Any]:
         """Keep the file in memory."""
         digest = hashlib.sha256(data).hexdigest()
@@ -101,9 +117,15 @@ class FakeContext:
         """Note the partial result."""
         self.partials.append(result)
 
-    def checkpoint(self, data: dict[str, Any]) -> None:  # noqa: ARG002 - the runner's signature
-        """Fail: nobody should."""
-        raise AssertionError("no handler keeps checkpoints yet")
+    def checkpoint(self, data: dict[str, Any]) -> None:
+        """Note the checkpoint as a later attempt gets it; `interrupt` ends the run there, as a move does."""
+        self.checkpoints.append(msgspec.json.decode(msgspec.json.encode(data)))
+        if self.interrupt_after == len(self.checkpoints):
+            raise Moved
+
+    def checkpoint_due(self) -> bool:
+        """Whether one is wanted: always, so that handlers that ask are tested too."""
+        return True
 
     def sent(self, verb: str) -> list[dict[str, Any]]:
         """Return the arguments of every command of that verb."""
@@ -156,3 +178,16 @@ def handler(monkeypatch: pytest.MonkeyPatch) -> Callable[..., ModuleType]:
         return module
 
     return load
+
+
+@pytest.fixture
+def leave() -> Callable[..., dict[str, Any]]:
+    """Return a function that runs a handler until its checkpoint of that number, and returns what the next one gets."""
+
+    def run_until(run: Callable[[Any], Any], ctx: FakeContext, after: int) -> dict[str, Any]:
+        ctx.interrupt_after = after
+        with pytest.raises(Moved):
+            run(ctx)
+        return ctx.checkpoints[-1]
+
+    return run_until

@@ -14,7 +14,9 @@ from appliance.skills.catalogue import NOT_SKILLS, SKILLS, image_reference, load
 
 WITH_HANDLER = {
     "goto", "photograph", "detect", "pick", "place", "record_video", "report", "notify", "takeoff", "land",
+    "open", "close", "switch_on", "switch_off", "give", "say", "guide", "dock",
     "extract_frames", "hold", "return_home", "count", "find", "follow_path", "patrol", "plan_route", "orbit", "track",
+    "ask", "wait_for",
 }  # fmt: skip
 MODULES_OF = {"base": set[str](), "vision": {"numpy", "PIL"}}
 

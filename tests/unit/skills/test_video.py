@@ -181,3 +181,24 @@ def test_a_video_without_frames_is_a_failure(make_ctx: Make, handler: Load, ffmp
     with_video(ctx)
     with pytest.raises(ctx.Fail, match=r"aisle\.mp4 has no frame"):
         handler("extract_frames").run(ctx)
+
+
+def test_a_recording_takes_its_pieces_along(
+    make_ctx: Make, handler: Load, leave: Callable[..., Any], ffmpeg: Callable[..., Any]
+) -> None:
+    """Pieces recorded elsewhere are fetched, the others recorded, and all are in the video."""
+    ffmpeg()
+    whole = make_ctx(target="aisle", duration_s=25)
+    wanted = handler("record_video").run(whole)
+    for each in whole.scratch.glob("*.mp4"):
+        each.unlink()
+    first, second = make_ctx(target="aisle", duration_s=25), make_ctx(target="aisle", duration_s=25)
+    second.resume = leave(handler("record_video").run, first, 2)
+    for each in whole.scratch.glob("*.mp4"):
+        each.unlink()  # the scratch folder of the first attempt is gone
+    second.files = first.files
+    result = handler("record_video").run(second)
+    assert len(first.sent("record")) == 2
+    assert len(second.sent("record")) == 1
+    assert result["frames_recorded"] == wanted["frames_recorded"]
+    assert second.files[result["video"]["artifact"]] == whole.files[wanted["video"]["artifact"]]

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 
+import msgspec
 import pytest
 import structlog
 from textual.pilot import Pilot
@@ -27,10 +28,12 @@ from appliance.model import (
     TaskState,
     encode,
 )
+from appliance.model.open_enum import enums_open
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.tasks.api import PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk
+from appliance.tasks.api import PlanAnswer, PlanAsk, TaskList, TasksAsk
+from appliance.tasks.steering.api import CancelTaskAsk
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.data import FleetView
 from appliance.tui.settings import TuiConfig
@@ -39,7 +42,7 @@ pytestmark = pytest.mark.anyio
 
 PLAN = Plan(domain="patrol", subtasks=(Subtask(id="s1", skill="goto", robot="r1"),))
 OLD = TaskRecord(id="t-old", instruction="an older task", state=TaskState.SUCCEEDED, created_ns=1, sequence=3)
-CONFIG = TuiConfig(refresh_hz=10.0, reconnect_s=0.2, silence_s=1.0, resync_s=5.0, call_timeout_s=5.0)
+CONFIG = TuiConfig(refresh_hz=10.0, reconnect_s=0.2, silence_s=1.0, resync_s=5.0, write=True)
 
 
 class Gateway:
@@ -55,7 +58,7 @@ class Gateway:
         self._rpc.register("plan", PlanAsk, self._plan)
         self._rpc.register("submit", TaskRequest, self._submit)
         self._rpc.register("tasks", TasksAsk, self._tasks)
-        self._rpc.register("cancel", TaskAsk, self._cancel)
+        self._rpc.register("cancel", CancelTaskAsk, self._cancel)
         self._token = session.declare_alive(self.keys.alive(name))
         self._beat = asyncio.create_task(self._run())
 
@@ -73,7 +76,7 @@ class Gateway:
     async def _tasks(self, ask: TasksAsk) -> TaskList:
         return TaskList(tasks=(OLD,)[: ask.limit])
 
-    async def _cancel(self, ask: TaskAsk) -> TaskRecord:
+    async def _cancel(self, ask: CancelTaskAsk) -> TaskRecord:
         self.cancelled.append(ask.id)
         return TaskRecord(id=ask.id, instruction="x", state=TaskState.CANCELLING, created_ns=2, sequence=9)
 
@@ -131,8 +134,10 @@ async def _see(app: SwiftbotApp, pilot: Pilot[None], *wanted: str | Callable[[st
 async def test_fleet_and_pool_are_live(gateway: Gateway, app: SwiftbotApp) -> None:
     """Gateways, containers and robots put on their keys are on the screens, limits not enforced among them."""
     async with app.run_test(size=(80, 24)) as pilot:
-        await _see(app, pilot, "gw-a", "25%", "1/1", "r1", "limits are not enforced", "f1 · 1 gw · 1 robots")
+        await _see(app, pilot, "gw-a", "25%", "1/1", "limits are not enforced", "f1 · 1 gw · 1 robots")
         await pilot.press("3")
+        await _see(app, pilot, "r1", "zenoh")
+        await pilot.press("4")
         await _see(app, pilot, "c-one", "ready")
 
 
@@ -177,7 +182,7 @@ async def test_log_is_live(gateway: Gateway, app: SwiftbotApp) -> None:
     """Notices, run events and log lines are on the log screen; a malformed one is counted and does no harm."""
     async with app.run_test(size=(80, 24)) as pilot:
         await _see(app, pilot, "gw-a")
-        await pilot.press("4")
+        await pilot.press("7")
         keys, session = gateway.keys, gateway.session
         session.put(keys.log("gw-a"), b"\xff{")
         session.put(keys.notice("ops"), b"[1, 2")
@@ -186,6 +191,23 @@ async def test_log_is_live(gateway: Gateway, app: SwiftbotApp) -> None:
         event = RunEvent(task="t", subtask="s1", attempt=1, kind=RunEventKind.STARTED, gateway="gw-a", startup_ms=2.5)
         session.put(keys.run("t", "s1"), encode(event))
         await _see(app, pilot, "container died", "patrol over", "t/s1 · started · start 2.5 ms")
+
+
+async def test_states_of_a_newer_version_are_shown(gateway: Gateway, app: SwiftbotApp) -> None:
+    """A task and a container in states that only a newer gateway knows are on the screens with those states' words."""
+    keys, session = gateway.keys, gateway.session
+    task = msgspec.json.decode(encode(TaskRecord(id="t-new", instruction="x", created_ns=9))) | {"state": "dreaming"}
+    container = ContainerInfo(id="c-two", gateway=gateway.name, image="base", state=ContainerState.READY)
+    asleep = msgspec.json.decode(encode(container)) | {"state": "hibernating", "depth_m": 3}
+    with enums_open():
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _see(app, pilot, "gw-a")
+            session.put(keys.task("t-new"), encode(task))
+            session.put(keys.container(gateway.name, "c-two"), encode(asleep))
+            await pilot.press("2")
+            await _see(app, pilot, "t-new", "? dreaming")
+            await pilot.press("4")
+            await _see(app, pilot, "c-one", "c-two", "? hiberna")
 
 
 async def test_lost_gateway_comes_back(app: SwiftbotApp, free_port: int) -> None:
@@ -236,5 +258,5 @@ def test_own_log_lines_go_to_the_log_screen(free_port: int) -> None:
         structlog.get_logger("x").warning("refused", what="malformed log")
     finally:
         structlog.configure(**before)
-    (entry,) = view.snapshot().entries
+    (entry,) = view.store.entries
     assert (entry.source, entry.level, entry.text) == ("tui", "warning", "refused what=malformed log")

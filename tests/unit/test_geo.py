@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Box, Site
-from appliance.robots.geo import bearing_deg, blocked_leg, crosses, inside, to_globe, to_site, turn_deg
+from appliance.model.geo import bearing_deg, blocked_leg, crosses, inside, to_globe, to_site, turn_deg
 
 METRES = st.floats(-10_000.0, 10_000.0)
 

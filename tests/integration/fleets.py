@@ -1,0 +1,33 @@
+"""Local fleets for tests: real processes under a name of their own, ended and cleaned up afterwards."""
+
+import os
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from appliance import local_fleet
+from appliance.config import GatewayConfig
+from appliance.llm.settings import LlmConfig
+from appliance.local_fleet import FleetState, Order
+from appliance.pool.settings import PoolConfig
+
+RULES = LlmConfig(tiers=("rules",))
+"""Where plans are not what a test is about: the same words always give the same plan, and no gateway loads a model."""
+PLAIN = GatewayConfig(id="base", llm=RULES)
+
+
+@asynccontextmanager
+async def fleet_in(folder: Path, **order: Any) -> AsyncIterator[FleetState]:
+    """Run a fleet whose files are in a folder; `order` is as `local_fleet.Order` has it, without MAVLink."""
+    wanted = Order(
+        fleet=f"t{os.getpid()}-{time.monotonic_ns() % 100000}",
+        directory=folder / "fleet",
+        **{"mavlink": 0, "pool": PoolConfig(floor={"base": 1}), "base": PLAIN} | order,
+    )
+    state = await local_fleet.up(wanted, progress=print, timeout_s=90.0)
+    try:
+        yield state
+    finally:
+        await local_fleet.down(wanted.directory, progress=print)

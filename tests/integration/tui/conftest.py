@@ -1,0 +1,56 @@
+"""One real fleet for all tests of a module: starting one takes longer than what most of them do with it."""
+
+import textwrap
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from fleets import fleet_in
+from moving_bench import write_skills
+
+from appliance.config import GatewayConfig
+from appliance.llm.settings import LlmConfig
+from appliance.local_fleet import FleetState
+from appliance.pool.settings import PoolConfig
+
+LAME = "lame"
+"""An image that the fleet knows and that does not exist until a test makes it."""
+
+
+def write_image(skills: Path) -> Path:
+    """Write the description of that image beside skills; returns its folder."""
+    folder = skills / "images" / LAME
+    folder.mkdir(parents=True)
+    (folder / "image.toml").write_text(
+        textwrap.dedent(f"""
+            # Of this run alone: {skills}
+            name = "{LAME}"
+            packages = ["python3"]
+        """)
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def lame(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of that image."""
+    return write_image(write_skills(tmp_path_factory.mktemp("skills")))
+
+
+@pytest.fixture(scope="module")
+async def fleet(lame: Path, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[FleetState]:
+    """Two gateways with skills that count, a recorder and two rovers, each a process of its own.
+
+    Plans are the rules': the same words give the same plan, before and after a test brings a model.
+    """
+    async with fleet_in(
+        tmp_path_factory.mktemp("fleet"),
+        gateways=2,
+        zenoh=2,
+        sim_rate=4.0,
+        pool=PoolConfig(floor={"base": 2}, bad_starts=1, quarantine_s=600.0, starts_at_once=2),
+        base=GatewayConfig(
+            id="gw-1", llm=LlmConfig(tiers=("rules", "local"), local_model=""), skills=(str(lame.parent.parent),)
+        ),
+    ) as state:
+        yield state

@@ -1,0 +1,478 @@
+"""Each order of the terminal UI that changes something, given by key or line to one real fleet that does it.
+
+What came of it is asked of the fleet itself, by a client that has no part in the terminal UI.
+"""
+
+import asyncio
+import importlib.util
+import io
+import tarfile
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+from moving_bench import counting, pretty
+
+from appliance.client import FleetClient
+from appliance.local_fleet import FleetState
+from appliance.model import (
+    Approval,
+    ContainerState,
+    Plan,
+    RobotInfo,
+    Subtask,
+    SubtaskState,
+    TaskRecord,
+    TaskRequest,
+    TaskState,
+)
+from appliance.pool.images import reference
+from appliance.pool.settings import PoolConfig
+from appliance.skills.catalogue import load_catalogue
+from appliance.tui.dialogs import ConfirmDialog
+from appliance.tui.robots.takeover import TakeoverScreen
+from appliance.tui.tasks.review import ReviewScreen
+
+from .conftest import LAME
+from .operating import LONG_S, Operator, operator
+
+pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
+
+ENDLESS = 4000
+"""Steps of a run that is ended before it has made them."""
+TOUR = "rover_1: go to dock 3, then go to dock 2"
+
+
+@pytest.fixture
+async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
+    """Return somebody else's eyes on the fleet."""
+    async with FleetClient(fleet.endpoint, operator="eve") as made:
+        yield made
+
+
+@pytest.fixture
+async def ann(fleet: FleetState) -> AsyncIterator[Operator]:
+    """Return an operator at a terminal UI on it."""
+    async with operator(fleet, "ann") as it:
+        yield it
+
+
+async def record_of(client: FleetClient, task: str, holds: Callable[[TaskRecord], object]) -> TaskRecord:
+    """Wait until a task's record is so; after a minute, fail with how it is."""
+    record: TaskRecord | None = None
+    try:
+        async with asyncio.timeout(LONG_S):
+            while not holds(record := await client.task(task)):
+                await asyncio.sleep(0.1)
+    except TimeoutError:
+        pytest.fail(f"it never came to be so: {pretty(record)}")
+    return record
+
+
+def running(record: TaskRecord) -> bool:
+    """Whether a subtask of it runs. How far it is, a record tells no oftener than it is written for other reasons."""
+    return any(each.state is SubtaskState.RUNNING for each in record.subtasks)
+
+
+def final(record: TaskRecord) -> bool:
+    """Whether it has ended."""
+    return record.state.final
+
+
+async def select(ann: Operator, task: str) -> None:
+    """Go to a task on the screen of tasks."""
+    await ann.press("2")
+    await ann.until(lambda: task in ann.store.tasks)
+    with ann.app._context():
+        ann.app.show_task(task)
+    await ann.until(lambda: ann.chosen.get("task") == task)
+
+
+async def confirm(ann: Operator, *words: str) -> None:
+    """Read a question, and say yes."""
+    await ann.until(lambda: isinstance(ann.app.screen, ConfirmDialog))
+    await ann.see(*words)
+    await ann.press("y")
+
+
+async def proposed(ann: Operator, client: FleetClient) -> TaskRecord:
+    """Submit the tour for review; its record once the plan waits and is looked at."""
+    known = set(ann.store.tasks)
+    await ann.press("s")
+    await ann.see("What shall the robots do?")
+    await ann.write(TOUR)
+    await ann.press("enter")
+    await ann.see("Enter runs this plan")
+    await ann.press("f2")
+    await ann.until(lambda: isinstance(ann.app.screen, ReviewScreen))
+    (task,) = set(ann.store.tasks) - known
+    record = await record_of(client, task, lambda record: record.state is TaskState.PROPOSED)
+    await ann.see("waits for approval", "goto")
+    return record
+
+
+# --- tasks -------------------------------------------------------------------------------------------------------
+
+
+async def test_approve_an_edited_plan(ann: Operator, client: FleetClient) -> None:
+    """Another robot, other parameters, one subtask fewer: checked, approved, and run so and not otherwise."""
+    task = (await proposed(ann, client)).id
+    await ann.press("home", "r")
+    await ann.write("rover_2")
+    await ann.press("enter")
+    await ann.see("robot: rover_1 → rover_2", "checked")
+    await ann.press("e")
+    await ann.until(lambda: ann.app.front is not None and ann.app.front.prompt.writing)
+    assert ann.app.front is not None
+    ann.app.front.prompt.field.value = 'edit-params s1 place="dock 1"'
+    await ann.press("enter")
+    await ann.see("dock 1", "checked: it may run")
+    await ann.press("end", "d")
+    await ann.see("taken out", "checked: it may run")
+    await ann.press("a")
+    await confirm(ann, "Approve the edited plan", "rover_2")
+    record = await record_of(client, task, final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+    (step,) = [each.subtask for each in record.subtasks]
+    assert (step.robot, step.params["place"]) == ("rover_2", "dock 1")
+    assert record.decision is not None
+    assert (record.decision.by, record.decision.edited) == ("ann", True)
+
+
+async def test_reject(ann: Operator, client: FleetClient) -> None:
+    """A plan that is turned down does not run, and the record says who did so."""
+    task = (await proposed(ann, client)).id
+    await ann.press("x")
+    await confirm(ann, "Reject the plan")
+    record = await record_of(client, task, final)
+    assert record.decision is not None
+    assert (record.decision.by, record.decision.approved) == ("ann", False)
+    assert all(not each.attempts for each in record.subtasks)
+
+
+async def test_pause_hold_and_resume(ann: Operator, client: FleetClient) -> None:
+    """Paused, nothing further begins; held, a run ends at its checkpoint; resumed, it goes on in a new attempt."""
+    await client.submit(counting("t-hold", steps=ENDLESS))
+    await record_of(client, "t-hold", running)
+    await select(ann, "t-hold")
+    await ann.press("p")
+    await record_of(client, "t-hold", lambda record: record.paused)
+    await ann.see("‖ paused")
+    await ann.press("r")
+    await confirm(ann, "Resume task t-hold?")
+    await record_of(client, "t-hold", lambda record: not record.paused)
+    await ann.line("hold t-hold a visitor")
+    await confirm(ann, "Hold task t-hold?")
+    record = await record_of(client, "t-hold", lambda record: record.paused and not running(record))
+    assert record.paused == "paused by ann: a visitor"
+    await ann.line("resume t-hold")
+    await confirm(ann, "Resume task t-hold?")
+    record = await record_of(client, "t-hold", lambda record: running(record) and record.of("s1").attempt == 2)
+    assert not record.paused
+    await client.cancel("t-hold")
+
+
+async def test_cancel_and_retry(ann: Operator, client: FleetClient) -> None:
+    """A cancelled task ends with who asked for it; tried again, whole or one subtask of it, it runs again."""
+    await client.submit(counting("t-again", steps=ENDLESS, count=2))
+    await record_of(client, "t-again", running)
+    await select(ann, "t-again")
+    await ann.press("c")
+    await confirm(ann, "Cancel task t-again?")
+    record = await record_of(client, "t-again", final)
+    assert record.state is TaskState.CANCELLED
+    assert record.cancelled_by is not None
+    assert record.cancelled_by.by == "ann"
+    await ann.see("cancelled")
+    await ann.press("t")
+    await confirm(ann, "Try task t-again again?")
+    await record_of(client, "t-again", running)
+    await ann.line("cancel t-again")
+    await confirm(ann, "Cancel task t-again?")
+    await record_of(client, "t-again", final)
+    await ann.line("retry-subtask t-again/s2")
+    await confirm(ann, "Try t-again/s2 again?")
+    record = await record_of(client, "t-again", running)
+    assert (record.retries, record.of("s2").state) == (2, SubtaskState.RUNNING)
+    await client.cancel("t-again")
+
+
+async def test_migrate_by_hand(ann: Operator, client: FleetClient) -> None:
+    """A run is moved to the other gateway with its checkpoint, and ends there."""
+    await client.submit(counting("t-move", steps=200))
+    record = await record_of(client, "t-move", running)
+    source = record.of("s1").gateway
+    (target,) = {"gw-1", "gw-2"} - {source}
+    await select(ann, "t-move")
+    await ann.press("enter")
+    await ann.until(lambda: ann.chosen.get("subtask") == "t-move/s1")
+    await ann.line(f"migrate t-move/s1 {target}")
+    await ann.hears(f"moved from {source} to {target}")
+    record = await record_of(client, "t-move", final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+    assert record.of("s1").gateway == target
+    assert (record.of("s1").result or {})["resumed_from"] > 0
+
+
+async def test_answer_a_question(ann: Operator, client: FleetClient) -> None:
+    """What a skill asks is on the robot's line; the answer reaches the skill, which ends with it."""
+    wait = Subtask(id="s1", skill="wait_for", robot="rover_1", params={"event": "the gate is open"})
+    plan = Plan(domain="interaction", subtasks=(wait,))
+    await client.submit(TaskRequest(instruction="wait", id="t-ask", plan=plan))
+    await ann.press("3", "home")
+    await ann.see("? asks")
+    await ann.until(lambda: "enquiry" in ann.chosen)
+    await ann.press("A")
+    await ann.write("yes")
+    await ann.press("enter")
+    await ann.hears("answered:", "the gate is open", "yes")
+    record = await record_of(client, "t-ask", final)
+    assert (record.subtasks[0].result or {})["confirmed"] is True
+
+
+# --- robots ------------------------------------------------------------------------------------------------------
+
+
+def rover(client: FleetClient, name: str = "rover_1") -> RobotInfo:
+    """Return a rover as it tells itself."""
+    return client.plane.registry.robots[name]
+
+
+async def test_take_over_and_give_back(ann: Operator, client: FleetClient) -> None:
+    """While a key is held the robot moves, nobody else's order does, and given back it is anybody's again."""
+    await ann.press("3", "home")
+    await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
+    await ann.press("o")
+    await confirm(ann, "Take rover_1 over?")
+    await ann.see("⇅ yours")
+    before = rover(client).pose
+    async with asyncio.timeout(LONG_S):
+        while rover(client).pose == before:
+            await ann.press("up")
+            await asyncio.sleep(0.1)
+    await client.submit(TaskRequest(instruction="rover_1: go to dock 2", id="t-wait"))
+    await record_of(client, "t-wait", lambda record: record.subtasks and "taken over" in record.subtasks[0].note)
+    await ann.press("g")
+    await ann.until(lambda: not isinstance(ann.app.screen, TakeoverScreen))
+    record = await record_of(client, "t-wait", final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+    acts, _ = await client.acts(20)
+    assert {"control_take", "control_give"} <= {act.verb for act in acts if act.by == "ann"}
+
+
+async def test_stop_and_resume_one_robot(ann: Operator, client: FleetClient) -> None:
+    """One key stops the robot under the cursor and no other; let go, after a question, it is free again."""
+    await ann.press("3", "home")
+    await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
+    await ann.press("x")
+    await ann.hears("soft stop of rover_1", "holding: rover_1")
+    await ann.see("■ stopped")
+    (stop,) = (await client.standing()).active
+    assert (stop.robots, stop.by) == (("rover_1",), "ann")
+    await ann.press("z")
+    await confirm(ann, "Lift the soft stop of rover_1?")
+    await ann.hears("rover_1 may move again")
+    assert not (await client.standing()).active
+
+
+async def test_stop_and_resume_the_fleet(ann: Operator, client: FleetClient) -> None:
+    """F8 stops all robots, read-only too, and their tasks wait; lifting it needs unlocking, asks, and frees all."""
+    await client.submit(TaskRequest(instruction=f"{TOUR}, then go to dock 3", id="t-stop"))
+    await record_of(client, "t-stop", lambda record: any(each.attempt for each in record.subtasks))
+    await ann.press("R", "f8")
+    await ann.hears("soft stop of the fleet", "rover_1", "rover_2")
+    record = await record_of(client, "t-stop", lambda record: record.paused)
+    assert "ann" in record.paused
+    await ann.line("resume-robots")
+    await ann.see("read-only")
+    assert (await client.standing()).active
+    await ann.press("W")
+    await ann.line("resume-robots")
+    await confirm(ann, "Lift the soft stop of all robots?")
+    await ann.hears("all robots may move again")
+    assert not (await client.standing()).active
+    record = await record_of(client, "t-stop", final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+
+
+# --- gateways and pools ------------------------------------------------------------------------------------------
+
+
+async def test_drain_and_undrain(ann: Operator, client: FleetClient) -> None:
+    """A drained gateway says so of itself and gets no run; undrained it is as before."""
+    await ann.press("1", "home")
+    await ann.until(lambda: ann.chosen.get("gateway") == "gw-1")
+    await ann.until(lambda: ann.store.gateways["gw-1"].latency_ms is not None)
+    await ann.press("d")
+    await confirm(ann, "Drain gw-1?")
+    await ann.until(lambda: client.plane.registry.gateways["gw-1"].draining)
+    await ann.see("◌ draining")
+    await client.submit(counting("t-dry", steps=2))
+    record = await record_of(client, "t-dry", final)
+    assert record.of("s1").gateway == "gw-2"
+    await ann.press("u")
+    await ann.until(lambda: not client.plane.registry.gateways["gw-1"].draining)
+    await ann.see("gw-1", without="◌ draining")
+
+
+async def test_warm_and_evict(ann: Operator, client: FleetClient) -> None:
+    """Containers that are asked for get ready; the one under the cursor is given up, after a question."""
+
+    def held() -> set[str]:
+        known = client.plane.registry.containers.get("gw-2", {})
+        return {name for name, each in known.items() if each.state is ContainerState.READY and "base" in each.image}
+
+    await ann.press("4")
+    await ann.line("warm base 3 gw-2")
+    await ann.hears("gw-2: ", "of base ready")
+    await ann.until(lambda: len(held()) >= 3)
+    await ann.see("◔ start")
+    await ann.until(lambda: any(each.gateway == "gw-2" for each in ann.store.containers.values()))
+    await ann.press("end")
+    await ann.until(lambda: ann.chosen.get("gateway") == "gw-2" and ann.chosen["container"] in held())
+    victim = ann.chosen["container"]
+    await ann.press("e")
+    await confirm(ann, f"Give up {victim}?")
+    await ann.hears("1 given up")
+    await ann.until(lambda: victim not in client.plane.registry.containers.get("gw-2", {}))
+    await ann.line("acts")
+    await ann.see("pool_evict", "pool_warm", "ann")
+
+
+async def podman(*arguments: str) -> None:
+    """Run podman; fails with what it says."""
+    process = await asyncio.create_subprocess_exec(
+        "podman", *arguments, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+    )
+    said, _ = await process.communicate()
+    assert process.returncode == 0, said.decode()
+
+
+@pytest.fixture
+async def broken(lame: Path, tmp_path: Path) -> AsyncIterator[Callable[[], object]]:
+    """Make an image of which no container starts; returns what mends it."""
+    catalogue = load_catalogue([lame.parent.parent])
+    mine, good = (reference(catalogue.images[name], PoolConfig()) for name in (LAME, "base"))
+    empty = tmp_path / "empty.tar"
+    with tarfile.open(empty, "w") as archive:
+        archive.addfile(tarfile.TarInfo("nothing"), io.BytesIO())
+    await podman("import", str(empty), mine)
+
+    async def mend() -> None:
+        await podman("tag", good, mine)
+
+    yield mend
+    await podman("rmi", "--force", "--ignore", mine)
+
+
+async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callable[[], object]) -> None:
+    """An image that does not start is left alone with the reason; mended and released, containers of it start."""
+    await ann.press("1")
+    await ann.line(f"warm {LAME} 1 gw-1")
+    await ann.until(lambda: "left alone" in client.plane.registry.gateways["gw-1"].pool_problem)
+    await ann.see("✘ gw-1", "left alone")
+    await ann.line("release base gw-1")
+    await ann.hears("base is not in quarantine")
+    mending = broken()
+    assert asyncio.iscoroutine(mending)
+    await mending
+    await ann.line(f"release {LAME} gw-1")
+    await ann.hears("gw-1: started again")
+    await ann.line(f"warm {LAME} 1 gw-1")
+    await ann.hears(f"gw-1: 1 of {LAME} ready")
+    await ann.line(f"evict {LAME} gw-1")
+    await confirm(ann, f"Give up {LAME}?")
+    await ann.hears("1 given up")
+
+
+async def test_fetch_an_image(ann: Operator, fleet: FleetState) -> None:
+    """A gateway is asked to have an image; on one machine it has what the others have, and says so."""
+    await ann.line(f"fetch {reference(load_catalogue().images['base'], PoolConfig())} gw-2")
+    await ann.hears("is on gw-2")
+
+
+async def test_swap_the_model(ann: Operator, client: FleetClient, project_root: Path, tmp_path: Path) -> None:
+    """A model is tested before it takes over; then the gateway says that it plans with it. No model is refused."""
+    spec = importlib.util.spec_from_file_location("tiny_model", project_root / "tests" / "tiny_model.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    folder = module.build(tmp_path / "toy")
+    await ann.press("5", "home")
+    await ann.until(lambda: ann.chosen.get("gateway") == "gw-1")
+    await ann.line(f"swap-model gw-1 {tmp_path}/nothing")
+    await confirm(ann, "Have gw-1 plan with the model in")
+    await ann.until(lambda: any(each.level == "error" and "nothing" in each.text for each in ann.store.entries))
+    await ann.line(f"swap-model gw-1 {folder}")
+    await confirm(ann, "Have gw-1 plan with the model in")
+    await ann.hears("gw-1 plans with toy instead of")
+    await ann.until(
+        lambda: (
+            (planner := client.plane.registry.gateways["gw-1"].planner) is not None
+            and planner.slot is not None
+            and planner.slot.model == "toy"
+        )
+    )
+    await ann.see("toy")
+
+
+# --- two operators -----------------------------------------------------------------------------------------------
+
+
+async def test_two_operators_one_winner(fleet: FleetState, client: FleetClient) -> None:
+    """Both approve a plan, both pause a task, both take a robot: one does each time, the other hears who was faster."""
+    instruction = "rover_2: go to dock 1"
+    async with operator(fleet, "ann") as ann, operator(fleet, "bob") as bob:
+        both = (ann, bob)
+        await client.submit(TaskRequest(instruction=instruction, id="t-both", approval=Approval.ALWAYS))
+        for each in both:
+            await select(each, "t-both")
+            await each.see("? approve")
+            await each.press("a")
+            await each.until(lambda each=each: isinstance(each.app.screen, ReviewScreen))
+            await each.see("waits for approval")
+            await each.press("a")
+            await each.until(lambda each=each: isinstance(each.app.screen, ConfirmDialog))
+        for each in both:
+            await each.press("y")
+        record = await record_of(client, "t-both", lambda record: record.decision is not None)
+        assert record.decision is not None
+        winner, loser = both if record.decision.by == "ann" else both[::-1]
+        assert record.decision.by == winner.app.view.operator
+        await winner.until(lambda: not isinstance(winner.app.screen, ReviewScreen))
+        await loser.see("somebody was faster", f"{record.decision.by} has approved")
+        assert isinstance(loser.app.screen, ReviewScreen)
+        ended = await record_of(client, "t-both", final)
+        assert ended.state is TaskState.SUCCEEDED, ended.failure
+        assert [each.attempt for each in ended.subtasks] == [1]
+
+        await client.submit(counting("t-pause", steps=ENDLESS))
+        await record_of(client, "t-pause", running)
+        for each in both:
+            await each.until(lambda each=each: "t-pause" in each.store.tasks)
+        for each in both:
+            await each.line("pause t-pause")
+        record = await record_of(client, "t-pause", lambda record: record.paused)
+        (loser,) = [each for each in both if each.app.view.operator not in record.paused]
+        await loser.hears(":pause t-pause", record.paused)
+        await client.cancel("t-pause")
+
+        for each in both:
+            await each.line("takeover rover_2")
+            await each.until(lambda each=each: isinstance(each.app.screen, ConfirmDialog))
+        for each in both:
+            await each.press("y")
+        for each in both:
+            await each.until(lambda each=each: isinstance(each.app.screen, TakeoverScreen))
+        await ann.until(lambda: any("⇅ yours" in each.seen() for each in both))
+        await ann.until(lambda: any("not under your hand" in each.seen() for each in both))
+        winner, loser = both if "⇅ yours" in ann.seen() else both[::-1]
+        await loser.see("not under your hand", f"taken over by {winner.app.view.operator}")
+        for each in both:
+            await each.press("escape")
+        await client.cancel("t-pause") if not (await client.task("t-pause")).state.final else None
+    acts, silent = await client.acts(100)
+    assert not silent
+    told = [(act.verb, act.outcome) for act in acts if act.by in ("ann", "bob") and act.target.startswith("t-both")]
+    assert sorted(told) == [("approve", "conflict"), ("approve", "done")]

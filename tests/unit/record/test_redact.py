@@ -1,0 +1,114 @@
+"""Secrets never reach a log: planted ones are looked for in what is written."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.model import encode
+from appliance.plane.keys import Keys
+from appliance.record.about import about
+from appliance.record.facts import LoggedMessage
+from appliance.record.pipeline import Pipeline
+from appliance.record.redact import REDACTED, Redactor, known_secrets, names_a_secret, without_secrets
+from appliance.record.settings import RecordConfig
+from appliance.record.writer import LogWriter
+
+KEYS = Keys("f1")
+PLANTED = "hunter2-planted-9c1f"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["password", "db_password", "apiKey", "API_KEY", "api-key", "token", "accessToken", "client_secret", "passphrase",
+     "Authorization", "signing_key", "private_key_pem", "privateKey", "credentials", "HTTPAuthToken", "pwd"],
+)  # fmt: skip
+def test_names_of_secrets(name: str) -> None:
+    """However it is written, a name that says secret is one."""
+    assert names_a_secret(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["key", "keys", "tokens", "max_tokens", "token_count", "monkey", "passenger", "compass", "keyframe", ""]
+)
+def test_names_of_no_secrets(name: str) -> None:
+    """Words that merely look alike are kept: a log without its keys and tokens counted would be none."""
+    assert not names_a_secret(name)
+
+
+def test_fields_are_emptied_wherever_they_stand() -> None:
+    """Nested, in lists, of any type; the rest of the message stays; nothing there stays nothing."""
+    payload = encode({"a": [{"password": PLANTED, "n": 1}], "token": {"deep": PLANTED}, "secret": None, "key": "k"})
+    cleaned = json.loads(Redactor().json(payload))
+    assert cleaned == {"a": [{"password": REDACTED, "n": 1}], "token": REDACTED, "secret": None, "key": "k"}
+
+
+def test_names_written_with_escapes_are_seen() -> None:
+    """A name whose letters are written as escapes is the same name."""
+    assert PLANTED.encode() not in Redactor().json(b'{"pass\\u0077ord": "%s"}' % PLANTED.encode())
+
+
+def test_what_is_no_json_is_treated_as_if() -> None:
+    """A payload that was cut off, or never was JSON, loses its secrets all the same."""
+    assert PLANTED.encode() not in Redactor().json(b'{"n": 1, "password": "%s", "x": [' % PLANTED.encode())
+    assert PLANTED.encode() not in Redactor([PLANTED]).json(b"\xff" + PLANTED.encode())
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=12), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(json_values, st.sampled_from(["password", "apiKey", "session_token"]))
+def test_planted_anywhere(value: Any, name: str) -> None:
+    """A planted secret is gone from wherever it is, and a message without any comes back byte for byte."""
+    redactor = Redactor()
+    assert PLANTED.encode() not in redactor.json(encode({"before": value, name: PLANTED, "after": [{name: PLANTED}]}))
+    plain = encode({"value": value})
+    if json.loads(plain) == without_secrets(json.loads(plain)):
+        assert redactor.json(plain) is plain
+
+
+def test_known_secrets_of_environment_and_configuration() -> None:
+    """Only what is named so, and long enough to be looked for; nested tables too."""
+    found = known_secrets(
+        {"API_TOKEN": PLANTED, "HOME": "/home/somebody", "PASSWORD": "abc"}, {"x": {"secret": "s" * 9}}
+    )
+    assert set(found) == {PLANTED, "s" * 9}
+
+
+def test_no_planted_secret_is_in_the_file(tmp_path: Path) -> None:
+    """Planted in configuration, key file, environment, fields, free text and frames: none is in the file's bytes."""
+    (tmp_path / "key").write_text("file-secret-51c0\n")
+    configuration = {
+        "id": "gw-1",
+        "llm": {"upstream_key_file": str(tmp_path / "key"), "password": "conf-secret-77aa"},
+        "robots": {"mavlink": [{"listen": "udp://127.0.0.1:1", "signing": "credential:mavlink"}]},
+    }
+    told = about(configuration, {"MY_API_KEY": "env-secret-19be", "PATH": "/bin"})
+    config = RecordConfig(directory=str(tmp_path / "log"), free_bytes=0, compression="none")
+    writer = LogWriter(config, fleet="f1", attached=told.attached)
+    writer.prepare()
+    pipeline = Pipeline(config, fleet="f1", writer=writer, secrets=told.secrets)
+    for key, payload in (
+        (KEYS.log("g1"), encode({"event": "x", "fields": {"apiToken": PLANTED, "said": "env-secret-19be!"}})),
+        (
+            KEYS.exchange("g1", "submit"),
+            encode({"request": {"instruction": "say file-secret-51c0", "password": PLANTED}}),
+        ),
+        (KEYS.mavlink("r1", "rx"), b"\xfd" + b"x" * 12 + b"conf-secret-77aa"),
+        (KEYS.notice("ops"), b'{"password": "' + PLANTED.encode()),
+    ):
+        pipeline.write(LoggedMessage(key, 5, payload, "application/json"))
+    writer.close()
+    data = b"".join(path.read_bytes() for path in (tmp_path / "log").iterdir())
+    for secret in (PLANTED, "file-secret-51c0", "conf-secret-77aa", "env-secret-19be"):
+        assert secret.encode() not in data
+    assert b"configuration.json" in data
+    assert b"credential:mavlink" in data
+    assert pipeline.redactor.count == 4

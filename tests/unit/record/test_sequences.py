@@ -1,0 +1,91 @@
+"""Holes in the numbers that speakers give to their messages."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.model import LogLine, encode
+from appliance.plane.keys import Keys
+from appliance.record.facts import LoggedMessage
+from appliance.record.pipeline import Pipeline
+from appliance.record.reader import info
+from appliance.record.sequences import MOST_SOURCES, Sequences
+from appliance.record.settings import RecordConfig
+from appliance.record.writer import LogWriter
+
+KEYS = Keys("f1")
+
+
+def _line(number: int) -> bytes:
+    return encode(LogLine(at_ns=1, level="info", source="g", event='"number": 99', number=number))
+
+
+@given(st.sets(st.integers(1, 60), min_size=1))
+def test_every_missing_number_is_counted(heard: set[int]) -> None:
+    """Whichever of a speaker's numbers arrive, those missing in between are counted."""
+    sequences = Sequences(KEYS)
+    for number in sorted(heard):
+        sequences.heard("log", KEYS.log("g1"), b'{"number":%d}' % number)
+    assert sequences.missing.get("log", 0) == max(heard) - min(heard) + 1 - len(heard)
+
+
+def test_speakers_are_told_apart() -> None:
+    """Another gateway, another attempt, a new coordinator, a process that counts anew: none of them is a hole."""
+    sequences = Sequences(KEYS)
+    for key, payload in (
+        (KEYS.log("g1"), b'{"number":7}'),
+        (KEYS.log("g2"), b'{"number":3}'),
+        (KEYS.log("g1"), b'{"number":1}'),
+    ):
+        assert sequences.heard("log", key, payload) is None
+    for attempt, number in ((1, 1), (1, 2), (2, 1), (2, 2)):
+        payload = b'{"attempt":%d,"number":%d}' % (attempt, number)
+        assert sequences.heard("run", KEYS.run("t", "s"), payload) is None
+    for coordinator, number in ((b"g1", 1), (b"g1", 2), (b"g2", 9), (b"g2", 10)):
+        payload = b'{"sequence":%d,"coordinator":"%s"}' % (number, coordinator)
+        assert sequences.heard("transition", KEYS.transition("t"), payload) is None
+    assert sequences.missing == {}
+
+
+@pytest.mark.parametrize("header", [b"\xfd\x09\x00\x00", b"\xfe\x09"], ids=["MAVLink 2", "MAVLink 1"])
+def test_frames_count_in_a_byte(header: bytes) -> None:
+    """The number after 255 is 0; a frame that was overtaken is no hole; components count for themselves."""
+    sequences = Sequences(KEYS)
+    key = KEYS.mavlink("r1", "rx")
+
+    def frame(number: int, component: int = 1) -> bytes:
+        return header + bytes((number, 1, component)) + bytes(12)
+
+    for number in (254, 255, 0, 1):
+        assert sequences.heard("mavlink", key, frame(number)) is None
+    assert sequences.heard("mavlink", key, frame(40, component=2)) is None
+    hole = sequences.heard("mavlink", key, frame(5))
+    assert hole is not None
+    assert hole.missing == 3
+    assert sequences.heard("mavlink", key, frame(4)) is None
+    assert sequences.heard("mavlink", key, b"\xfd") is None
+
+
+def test_speakers_are_forgotten_beyond_a_bound() -> None:
+    """A flood of names does not fill the memory."""
+    sequences = Sequences(KEYS)
+    for number in range(MOST_SOURCES + 50):
+        sequences.heard("log", f"swiftbot/f1/gw/g{number}/log", b'{"number":1}')
+    assert len(sequences._last) == MOST_SOURCES
+
+
+def test_holes_are_in_the_log_apart_from_what_was_dropped(tmp_path: Path) -> None:
+    """A log says how many messages never came, and from whom; that is not the recorder's loss."""
+    config = RecordConfig(directory=str(tmp_path), free_bytes=0, fsync=False)
+    writer = LogWriter(config, fleet="f1")
+    writer.prepare()
+    pipeline = Pipeline(config, fleet="f1", writer=writer)
+    for number in (1, 2, 6):
+        pipeline.write(LoggedMessage(KEYS.log("g1"), 5, _line(number), "application/json"))
+    pipeline.tick()
+    writer.close()
+    told = info(writer.files[0])
+    assert (told.not_heard, told.dropped) == (3, 0)
+    assert writer.not_heard == {"log": 3}

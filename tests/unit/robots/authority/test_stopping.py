@@ -1,0 +1,145 @@
+"""Soft stops on one gateway: robots and gateways that were away are told to hold as long as the stop is in force."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from typing import Any, cast
+
+import pytest
+
+from appliance.model import SoftStop, encode
+from appliance.robots.authority import stopping
+from appliance.robots.authority.api import ResumeRobotsAsk, StandingAsk, StopAsk
+from appliance.robots.authority.stopping import STORED, Stopping
+from appliance.robots.authority.stops import MOST, RESERVE
+from tests.unit.robots.authority.conftest import FakePlane
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+async def known(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Stopping]:
+    """Return soft stops that were started with what the plane keeps; its rounds are short."""
+    monkeypatch.setattr(stopping, "AGAIN_S", (0.0,))
+    monkeypatch.setattr(stopping, "EVERY_S", 0.01)
+    it = Stopping(cast("Any", plane), changed=lambda: None)
+    yield it
+    await it.close()
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Wait until it is so."""
+    async with asyncio.timeout(10):
+        while not holds():
+            await asyncio.sleep(0.005)
+
+
+async def rounds(count: int = 5) -> None:
+    """Let some rounds pass."""
+    await asyncio.sleep(count * stopping.EVERY_S)
+
+
+async def nothing() -> None:
+    """Learn nothing from others."""
+
+
+async def test_a_robot_that_was_away_is_told_when_it_comes(plane: FakePlane, known: Stopping) -> None:
+    """However long it was, and again when it was away once more; until the stop is lifted."""
+    await known.start()
+    plane.robot("r1")
+    plane.robot("r2", online=False)
+    answer = await known.stop(StopAsk(by="ann"))
+    assert answer.robots == ("r1",)
+    assert "could not be told; it will be when it is back" in answer.problems["r2"]
+    await rounds()
+    assert plane.told == ["r1"]
+    plane.robot("r2")
+    await until(lambda: plane.told == ["r1", "r2"])
+    plane.robot("r1", online=False)
+    await rounds()
+    plane.robot("r1")
+    await until(lambda: plane.told == ["r1", "r2", "r1"])
+    await known.resume(ResumeRobotsAsk(), nothing)
+    plane.robot("r3")
+    await rounds()
+    assert "r3" not in plane.told
+
+
+async def test_a_robot_that_nobody_knows_is_told_when_it_comes(plane: FakePlane, known: Stopping) -> None:
+    """Named in a stop, it is a problem of the answer, and no success; when it comes it is told."""
+    await known.start()
+    answer = await known.stop(StopAsk(by="ann", robots=("r1",)))
+    assert answer.robots == ()
+    assert "not in the roster and could not be told; it will be if it comes" in answer.problems["r1"]
+    plane.robot("r1")
+    await until(lambda: plane.told == ["r1"])
+
+
+async def test_a_robot_that_does_not_confirm_is_told_on(plane: FakePlane, known: Stopping) -> None:
+    """It is asked again in each round, and not any more when it has said that it holds."""
+    await known.start()
+    plane.robot("r1")
+    plane.deaf = {"r1"}
+    assert "not reached" in (await known.stop(StopAsk(by="ann", robots=("r1",)))).problems["r1"]
+    await rounds()
+    plane.deaf = set()
+    await until(lambda: plane.told == ["r1"])
+    await rounds()
+    assert plane.told == ["r1"]
+
+
+@pytest.mark.parametrize(
+    "told", [b"hello", b'{"id": "\xff"}', b'{"id":"1","result":' + b'{"a":' * 6000 + b"1" + b"}" * 6001]
+)
+async def test_a_robot_that_answers_with_anything_keeps_no_other_from_holding(
+    told: bytes, plane: FakePlane, known: Stopping
+) -> None:
+    """Its answer is told as the problem that it is; the others hold, and it is told on."""
+    await known.start()
+    plane.robot("r1")
+    plane.robot("r2")
+    plane.mad["r1"] = told
+    answer = await known.stop(StopAsk(by="ann"))
+    assert answer.robots == ("r2",)
+    assert "it answered with something else" in answer.problems["r1"]
+    del plane.mad["r1"]
+    plane.told.clear()
+    await until(lambda: plane.told == ["r1"])
+
+
+async def test_a_gateway_that_returns_has_its_robots_hold(plane: FakePlane, known: Stopping) -> None:
+    """Stops that it kept are pursued from its start, also for robots that come later; those of others are not."""
+    kept = StandingAsk(stops=(SoftStop(id="s", by="ann"),))
+    plane.values[STORED] = encode(kept)
+    plane.robot("r2", gateway="gw-2")
+    await known.start()
+    await rounds()
+    plane.robot("r1")
+    await until(lambda: plane.told == ["r1"])
+    plane.robot("r2", gateway="gw-1")
+    await until(lambda: plane.told == ["r1", "r2"])
+
+
+async def test_the_fleet_is_stopped_whatever_is_in_force(plane: FakePlane, known: Stopping) -> None:
+    """By the reserve for such stops; and when that is used up, it is stopped already and its robots are told again."""
+    await known.start()
+    many = [SoftStop(id=f"s{number}", robots=(f"x{number}",)) for number in range(MOST - RESERVE)]
+    known.stops.merge(many, ())
+    plane.robot("r1")
+    for _ in range(RESERVE + 2):
+        plane.told.clear()
+        assert (await known.stop(StopAsk(by="ann"))).robots == ("r1",)
+        assert "r1" in plane.told
+    assert len(known.stops.stops) == MOST
+
+
+async def test_only_what_the_operator_has_seen_is_lifted(known: Stopping) -> None:
+    """One that came meanwhile stays; the same order, tried again, is done already and lifts nothing more."""
+    await known.start()
+    await known.stop(StopAsk(by="ann", act="a"))
+    await known.stop(StopAsk(by="bob", act="b"))
+    ask = ResumeRobotsAsk(by="ann", act="r", stops=("a",))
+    assert [each.id for each in (await known.resume(ask, nothing)).stops] == ["b"]
+    everything = ResumeRobotsAsk(by="ann", act="q")
+    assert (await known.resume(everything, nothing)).stops == ()
+    await known.stop(StopAsk(by="bob", act="c"))
+    assert [each.id for each in (await known.resume(everything, nothing)).stops] == ["c"]
