@@ -1,7 +1,8 @@
 """What a robot's companion computer, or a script beside a ground station, asks tasks of the fleet with, over MAVLink.
 
-Needs pymavlink and, of this project, the one module `appliance.robots.mavlink.tunnel`; both files can be copied. The
-connection is an ordinary one of `pymavlink.mavutil`; messages that are not for this client go to `on_other`.
+Needs pymavlink and, of this project, the modules `appliance.robots.mavlink.tunnel` and, for robots that speak Zenoh
+instead, `appliance.robots.zenoh_client`; the three files can be copied. The connection is an ordinary one of
+`pymavlink.mavutil`; messages that are not for this client go to `on_other`.
 
     connection = mavutil.mavlink_connection("udpout:gateway:14550", source_system=1, source_component=192)
     client = TaskClient(connection)
@@ -22,10 +23,23 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, cast
 
 from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel, NotDelivered
+from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskClient, ZenohTaskRejected
+
+__all__ = [
+    "AsyncTaskClient",
+    "AsyncZenohTaskClient",
+    "TaskClient",
+    "TaskRejected",
+    "ZenohTaskClient",
+    "ZenohTaskRejected",
+]
 
 FINAL = frozenset({"succeeded", "failed", "cancelled"})
 """States after which nothing follows."""
 POLL_S = 0.05
+BEAT_S = 1.0
+_ONBOARD = (18, 8, 0, 0, 4)
+"""MAV_TYPE_ONBOARD_CONTROLLER, no autopilot, active."""
 MAX_NEWS = 1000
 """Messages kept that nobody asked for yet."""
 
@@ -46,15 +60,26 @@ class TaskClient:
     """Asks for tasks and hears of them. Not for several threads at once.
 
     Args:
-        connection: of `pymavlink.mavutil`, MAVLink 2.
+        connection: of `pymavlink.mavutil`; it is switched to MAVLink 2 where it is not.
         gateway: system and component id of the gateway.
         on_other: given every message that is not this client's.
+        beats: send a heartbeat every second, as an onboard computer: gateways listen to those only whose heartbeat they
+            have heard. False where the connection's owner sends its own.
     """
 
     def __init__(
-        self, connection: Any, *, gateway: tuple[int, int] = (245, 191), on_other: Callable[[Any], None] | None = None
+        self,
+        connection: Any,
+        *,
+        gateway: tuple[int, int] = (242, 191),
+        on_other: Callable[[Any], None] | None = None,
+        beats: bool = True,
     ) -> None:
+        if not hasattr(connection.mav, "tunnel_send") and hasattr(connection, "auto_mavlink_version"):
+            connection.auto_mavlink_version(b"\xfd")  # mavutil begins with MAVLink 1, which has no TUNNEL
         self._connection = connection
+        self._beats = beats
+        self._beat_at = 0.0
         self._gateway = gateway
         self._on_other = on_other
         self._channel = Channel(lambda: secrets.randbits(32))
@@ -99,7 +124,11 @@ class TaskClient:
 
     def pump(self, timeout_s: float = POLL_S) -> None:
         """Send what is due and take in what comes; the other methods do so while they wait."""
-        for payload in self._channel.due(time.monotonic()):
+        now = time.monotonic()
+        if self._beats and now >= self._beat_at:
+            self._beat_at = now + BEAT_S
+            self._connection.mav.heartbeat_send(*_ONBOARD)
+        for payload in self._channel.due(now):
             self._connection.mav.tunnel_send(
                 *self._gateway, PAYLOAD_TYPE, len(payload), list(payload.ljust(MAX_PAYLOAD, b"\0"))
             )

@@ -24,6 +24,8 @@ from appliance.robots.verbs import RobotFailure, StopArgs, args_of, parse_args
 
 log = structlog.get_logger(__name__)
 
+UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+"""What comes of bytes that are no JSON of the kind; the last: nested a thousand deep."""
 LONG_POLL_S = 10.0
 """Longest that a query is held before its caller is told to ask again."""
 GRACE_S = 2.0
@@ -33,6 +35,7 @@ UNREACHABLE_S = 8.0
 _ASK_AGAIN_S = 0.2
 _STOP_TIMEOUT_S = 3.0
 _MAX_ID = 200
+_MAX_WHY = 300
 
 
 class Done(Struct, frozen=True):
@@ -77,7 +80,8 @@ class CommandDesk:
     """Takes commands for one robot: each id once, each actuator one at a time.
 
     `verbs` may be replaced while it runs (a vehicle's type is known by its heartbeat alone). `ready` raises
-    RobotFailure while the robot cannot be commanded; `halt` brings the base to rest after a `stop`.
+    RobotFailure while the robot cannot be commanded; `halt` brings the base to rest after a `stop`; `gate` says why a
+    command may not be carried out just now (a soft stop, an operator who has the robot), empty when it may.
     """
 
     def __init__(
@@ -90,8 +94,10 @@ class CommandDesk:
         ready: Callable[[], None],
         halt: Callable[[], Awaitable[None]],
         refused: dict[str, int],
+        gate: Callable[[str, RobotCommand], str] = lambda _, __: "",
     ) -> None:
         self.robot = robot
+        self._gate = gate
         self.verbs = verbs
         self._session = session
         self._ledger = ledger
@@ -110,7 +116,7 @@ class CommandDesk:
         """Answer one query of the command key; PayloadError when it is no RobotCommand."""
         try:
             command = msgspec.json.decode(payload, type=RobotCommand)
-        except msgspec.DecodeError as error:
+        except UNREADABLE as error:
             self._count("command_malformed")
             raise PayloadError(f"{key}: not a RobotCommand: {error}", remedy="send RobotCommand as JSON") from error
         if not 1 <= len(command.id) <= _MAX_ID:
@@ -165,6 +171,9 @@ class CommandDesk:
 
     async def _start(self, command: RobotCommand, verb: Verb, kind: type[Struct], *, announce: bool) -> RobotReply:
         args = parse_args(command.verb, command.args, kind)
+        if why := self._gate(self.robot, command):
+            # As busy, since it may be carried out later: handlers wait, and say for what.
+            raise RobotFailure("busy", f"{self.robot} is {why}", remedy="wait, or ask them", retryable=True)
         self._ready()
         rivals = [each for each in self._running.values() if set(each.uses) & set(verb.uses)]
         if rivals and not verb.preempts:
@@ -191,7 +200,7 @@ class CommandDesk:
         command = running.command
         reply: RobotReply | None = None
         try:
-            await self._end(rivals, Failure(code="cancelled", message=f"ended by {command.verb} ({command.id})"))
+            await self._end(rivals, Failure(code="cancelled", message=f"ended by {_named(command)}"))
             await self._ledger.take(command)
             if announce:
                 self._announce(command)
@@ -244,7 +253,8 @@ class CommandDesk:
         self._announce(command)
         chosen = [each for each in self._running.values() if args.id is None or each.command.id == args.id]
         moved = args.id is None or any("base" in each.uses for each in chosen)
-        await self._end(chosen, Failure(code="cancelled", message="stopped on request"))
+        why = f": {args.why}" if args.why else ""
+        await self._end(chosen, Failure(code="cancelled", message=f"stopped on request{why}"))
         if moved:
             await self._halt()
         return _reply(command, Done({"stopped": [each.command.id for each in chosen]}))
@@ -274,6 +284,12 @@ class CommandDesk:
 
 def _reply(command: RobotCommand, done: Done) -> RobotReply:
     return RobotReply(id=command.id, result=done.result, blobs=done.blobs)
+
+
+def _named(command: RobotCommand) -> str:
+    """What ended another command, with its reason where it gives one."""
+    why = command.args.get("why")
+    return f"{command.verb} ({command.id})" + (f": {why}" if isinstance(why, str) and why else "")
 
 
 _stopping: set[asyncio.Task[None]] = set()
@@ -324,7 +340,7 @@ async def _ask_until(session: Session, robot: str, command: RobotCommand, timeou
             continue
         try:
             return msgspec.json.decode(answer, type=RobotReply)
-        except msgspec.DecodeError as error:
+        except UNREADABLE as error:
             raise RobotError(f"{robot} answered {command.verb} with something else: {error}") from error
     if silent is not None:
         raise UnreachableError(
@@ -332,6 +348,19 @@ async def _ask_until(session: Session, robot: str, command: RobotCommand, timeou
             remedy="`swiftbot robots` shows who is online; is its gateway up?",
         ) from silent
     raise DeadlineError(f"{robot} did not end {command.verb} within {timeout_s:g} s", remedy="allow more time")
+
+
+async def hold_robot(session: Session, robot: str, *, why: str, identity: str, timeout_s: float = 10.0) -> RobotReply:
+    """Make a robot hold where it is: what its base does ends with `why`, and it stays until the next command.
+
+    A vehicle in the air hovers, one on the ground stands. A robot that a pilot or a failsafe has is left to them, and
+    the reply says so. Same `identity`: same hold.
+
+    Raises:
+        UnreachableError, DeadlineError, RobotError: as `send_command`.
+    """
+    command = RobotCommand(id=identity, verb="hold", args={"why": why[:_MAX_WHY]})
+    return await send_command(session, robot, command, timeout_s=timeout_s)
 
 
 async def _send_stop(session: Session, robot: str, command: RobotCommand) -> None:

@@ -3,11 +3,14 @@
 Zenoh robots speak for themselves and need nothing of a gateway; MAVLink vehicles are spoken for by the station.
 """
 
+import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from appliance.model import Site, TaskRequest
+from appliance.errors import NotFoundError
+from appliance.model import RobotCommand, Site, TaskRequest
 from appliance.plane.session import Session
+from appliance.robots.api import LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk
 from appliance.robots.doors import Tasks
 from appliance.robots.intake import TaskIntake
 from appliance.robots.ledger import KeyValues
@@ -17,8 +20,15 @@ if TYPE_CHECKING:
     from appliance.robots.mavlink.station import Station
 
 
+ADDED_LINKS = "mavlink/links"
+"""Where links added at run time are kept in the gateway's store."""
+
+
 class RobotHub:
-    """One per gateway. `refused` counts bad input by kind; `on_task` and `tasks` take what robots ask for."""
+    """One per gateway. `refused` counts bad input by kind; `on_task` and `tasks` take what robots ask for.
+
+    `gate` says why a robot may not be given a command just now.
+    """
 
     def __init__(
         self,
@@ -30,17 +40,20 @@ class RobotHub:
         site: Site,
         on_task: Callable[[str, TaskRequest], None] | None = None,
         tasks: Tasks | None = None,
+        gate: Callable[[str, RobotCommand], str] = lambda _, __: "",
     ) -> None:
         self._config = config
+        self._gate = gate
         self._session = session
         self._store = store
         self._gateway = gateway
         self._site = site
         self._tasks = tasks
         self.refused: dict[str, int] = {}
-        submit = None if tasks is None else tasks.submit
+        submit = None if tasks is None else tasks.submit_of
         self._intake = None if on_task is None else TaskIntake(session, on_task, self.refused, submit=submit)
         self._station: Station | None = None
+        self._opening = asyncio.Lock()
 
     @property
     def attached(self) -> tuple[str, ...]:
@@ -50,7 +63,15 @@ class RobotHub:
     async def start(self) -> None:
         """Bind the ports and begin; ConfigError with the remedy when a setting is wrong or a port taken."""
         self._config.check()
-        if self._config.mavlink:
+        if self._config.mavlink or await self._store.scan(ADDED_LINKS):
+            await self._open_station()
+        if self._intake is not None:
+            self._intake.start()
+
+    async def _open_station(self) -> "Station":
+        async with self._opening:
+            if self._station is not None:
+                return self._station
             # pymavlink's dialect costs 15 MB and 30 ms: only gateways with vehicles pay for it.
             from appliance.robots.mavlink.station import Station  # noqa: PLC0415
 
@@ -62,11 +83,30 @@ class RobotHub:
                 site=self._site,
                 refused=self.refused,
                 tasks=self._tasks,
+                gate=self._gate,
             )
             await station.start()
             self._station = station
-        if self._intake is not None:
-            self._intake.start()
+            return station
+
+    # --- links at run time: the verbs robot_links, robot_link_add, robot_link_remove ---------------------------
+
+    async def links(self, ask: LinksAsk) -> LinkList:
+        """All MAVLink links of this gateway, and what went over them."""
+        del ask
+        return LinkList(gateway=self._gateway) if self._station is None else self._station.link_list()
+
+    async def add_link(self, ask: LinkAdd) -> LinkFacts:
+        """Open a link and keep it over restarts; ConfigError or RefusedError when it cannot be."""
+        ask.link.check()
+        station = await self._open_station()
+        return await station.links.add(ask.link, by=ask.by)
+
+    async def remove_link(self, ask: LinkRemove) -> LinkFacts:
+        """Close a link for good; NotFoundError when there is none of that name."""
+        if self._station is None:
+            raise NotFoundError(f"no MAVLink link {ask.url[:120]!r}", remedy="this gateway has none")
+        return await self._station.links.remove(ask.url, by=ask.by)
 
     async def stop(self) -> None:
         """End commands (the next process resumes them), take back what was declared, close the ports."""

@@ -3,7 +3,8 @@
 This room knows nothing of tasks, so it only checks, bounds and hands over. A put is heard by every gateway of the
 fleet and answered by none; a request without an id gets one made of the robot, the text and the publisher's second,
 so that several gateways that submit it submit one task. A query goes to one gateway, and its answer is the task's
-record once that is durable, or the reason why not.
+record once that is durable, or the reason why not. The task is of the robot on whose key it came, whomever it names:
+what robots may have done (`safety.robot_tasks`), whose turn it is and who is told to have asked hang on that.
 """
 
 import hashlib
@@ -32,7 +33,7 @@ class TaskIntake:
         session: this gateway's.
         on_task: given each robot and what it put, on the event loop.
         refused: counters of bad input.
-        submit: hands in what was asked by query; None: queries are not answered here.
+        submit: hands in what a robot asked by query; None: queries are not answered here.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class TaskIntake:
         on_task: Callable[[str, TaskRequest], None],
         refused: dict[str, int] | None = None,
         *,
-        submit: Callable[[TaskRequest], Awaitable[TaskRecord]] | None = None,
+        submit: Callable[[str, TaskRequest], Awaitable[TaskRecord]] | None = None,
     ) -> None:
         self._session = session
         self._on_task = on_task
@@ -66,11 +67,11 @@ class TaskIntake:
         """Answer a query; errors are told to whoever asks."""
         assert self._submit is not None  # noqa: S101 - only served with one
         try:
-            _, request = read_request(Message(key, payload, False, time.time_ns(), ""))
+            robot, request = read_request(Message(key, payload, False, time.time_ns(), ""))
         except PayloadError:
             self.refused["task_malformed"] = self.refused.get("task_malformed", 0) + 1
             raise
-        return encode(await self._submit(request))
+        return encode(await self._submit(robot, request))
 
     def _heard(self, message: Message) -> None:
         if message.deleted:
@@ -85,13 +86,13 @@ class TaskIntake:
 
 
 def read_request(message: Message) -> tuple[str, TaskRequest]:
-    """Return the robot and its checked request, with id and submitter; PayloadError when it is none (pure)."""
+    """Return the robot and its checked request, with an id, and as its own; PayloadError when it is none (pure)."""
     robot = check_name(message.key.split("/")[-2], "robot")
     if len(message.payload) > MAX_BYTES:
         raise PayloadError(f"a task request of {len(message.payload)} bytes", remedy=f"at most {MAX_BYTES}")
     try:
         request = msgspec.json.decode(message.payload, type=TaskRequest)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested a thousand deep
         raise PayloadError(f"not a TaskRequest: {error}", remedy='send {"instruction": "..."} as JSON') from error
     if not request.instruction.strip() or len(request.instruction) > MAX_INSTRUCTION:
         raise PayloadError(f"an instruction has 1 to {MAX_INSTRUCTION} characters")
@@ -101,4 +102,8 @@ def read_request(message: Message) -> tuple[str, TaskRequest]:
     else:
         seed = b"\0".join((robot.encode(), message.payload, str(message.at_ns // _SECOND_NS).encode()))
         identity = f"r-{hashlib.sha256(seed).hexdigest()[:12]}"
-    return robot, msgspec.structs.replace(request, id=identity, submitter=request.submitter or robot)
+    plan = request.plan
+    if plan is not None and plan.provenance is not None:
+        # Where a plan came from is told by whoever made it here; of others it would get into the plan cache.
+        plan = msgspec.structs.replace(plan, provenance=None)
+    return robot, msgspec.structs.replace(request, id=identity, submitter=robot, plan=plan)

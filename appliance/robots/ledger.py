@@ -34,7 +34,7 @@ class KeyValues(Protocol):
         """Write durably."""
         ...
 
-    async def delete(self, key: str) -> None:
+    async def delete(self, key: str) -> object:
         """Remove."""
         ...
 

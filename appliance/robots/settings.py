@@ -1,10 +1,11 @@
 """What may be set about robots: where MAVLink vehicles are listened for, what they are called, how long to wait.
 
 A gateway listens on UDP or TCP as ground stations do, and vehicles (or SITL's `--out`, or mavlink-router) send to it;
-or it connects to what listens itself.
+or it connects to what listens itself, or to a serial port.
 Every figure that decides how long something is waited for is here and nowhere else.
 """
 
+import math
 import re
 from typing import Literal
 from urllib.parse import urlsplit
@@ -16,6 +17,7 @@ from appliance.plane.keys import check_name
 
 MAX_SYSTEM = 255
 MAX_TEMPLATE = 500
+MAX_MISSION = 2000
 _PLACEHOLDER = re.compile(r"\{(.*?)\}")
 _KNOWN_PLACES = frozenset({"robot", *"234567"})
 
@@ -25,15 +27,18 @@ DEFAULT_LISTEN = "udp://127.0.0.1:14550"
 
 
 class Remote(Struct, frozen=True):
-    """An address of MAVLink: listen there, or connect to it."""
+    """An address of MAVLink: listen there, or connect to it. Of a serial port `host` is its device, `port` its baud."""
 
-    scheme: Literal["udp", "tcp"]
+    scheme: Literal["udp", "tcp", "serial"]
     host: str
     port: int
     listens: bool
 
     def __str__(self) -> str:
-        return f"{self.scheme}://{self.host}:{self.port}"
+        if self.scheme == "serial":
+            return f"serial:{self.host}:{self.port}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.scheme}://{host}:{self.port}"
 
 
 class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,13 +47,14 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     listen: str = ""
     """`udp://host:port` or `tcp://host:port` to listen on. With neither `listen` nor `connect`: udp://127.0.0.1:14550."""
     connect: str = ""
-    """The same to connect to, again and again while nobody is there: a vehicle, SITL or a router that listens."""
+    """The same to connect to, again and again while nobody is there: a vehicle, SITL or a router that listens. Or
+    `serial:/dev/ttyUSB0:57600`, a serial port and its baud, which may be unplugged and plugged in again."""
     signing: str = ""
     """File with the link's MAVLink 2 signing key, readable by this user alone: a passphrase, or `hex:` and 64 digits;
     `credential:NAME` for one that systemd hands over. Set, every frame sent is signed and frames that are unsigned,
     wrongly signed or replayed are refused. Empty: no signing, and signed frames are refused."""
     only_in: tuple[str, ...] = ()
-    """Messages by name (`ATTITUDE`, ...) heard here that may go on to other links; none: all."""
+    """Messages by name (`ATTITUDE`, ...) or number heard here that may go on to other links; none: all."""
     not_in: tuple[str, ...] = ()
     """But not these."""
     only_out: tuple[str, ...] = ()
@@ -125,8 +131,19 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     route: bool = True
     """Pass frames on between links and ends, as MAVLink routers do: a ground station on one link then sees and
     commands the vehicles of the others. Off: the gateway alone speaks to its vehicles."""
-    system_id: int = 245
-    """Of the gateway as a MAVLink system; ground stations use 255 downward, vehicles 1 upward."""
+    sender_hz: float = 5000.0
+    """Most frames a second from one other end of a link, with a burst of as many: a vehicle sends 50 to 500, a router
+    with ten vehicles behind it ten times that. What more comes in datagrams is dropped and counted as `flood`, a
+    stream is read more slowly; the other ends do not notice. 0: no limit."""
+    repeat_s: float = 0.5
+    """The same bytes within so long are a repetition, which came by two ways or round a ring of routers, and go no
+    further. Such copies come within tenths of a second; some senders do say the same again after seconds."""
+    timesync_s: float = 5.0
+    """How often each end with a vehicle is asked for its time (TIMESYNC), which tells the latency. 0: never."""
+    mission_items: int = 200
+    """Most items of a mission uploaded to the gateway: a plan of as many steps is more than anybody reads."""
+    system_id: int = 242
+    """Of the gateway as a MAVLink system. Vehicles count from 1 up; ground stations have 255 and 254, MAVSDK 245."""
     component_id: int = 191
     """MAV_COMP_ID_ONBOARD_COMPUTER: autopilots leave commands to it alone."""
     heartbeat_s: float = 1.0
@@ -140,6 +157,13 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """At 20 % loss each way one exchange fails with 0.36; eight in a row with 0.0003."""
     takeoff_altitude_m: float = 10.0
     """Where a flight begins when no altitude is given."""
+    cruise_mps: float = 5.0
+    """Speed of a flight when none is given, within the site's limit: ArduCopter's own."""
+    drive_mps: float = 2.0
+    """The same of vehicles on the ground: ArduRover's own."""
+    servos: tuple[int, ...] = ()
+    """Servo outputs (1 to 16) that commands may set. None: among them are motors and rudders, which nothing else
+    tells from a lamp or a latch."""
     arrival_m: float = 1.5
     """Nearer than this to the last waypoint is there: GPS is no better."""
     stall_s: float = 45.0
@@ -159,24 +183,45 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             remotes.add(link.remote)
         for template in self.templates:
             template.check()
+        if any(not 1 <= each <= 16 for each in self.servos):
+            raise ConfigError("robots.servos: outputs count from 1 to 16", remedy="name those that are free")
+        for name, speed in (("cruise_mps", self.cruise_mps), ("drive_mps", self.drive_mps)):
+            if not 0.0 < speed <= 100.0:
+                raise ConfigError(f"robots.{name}: {speed:g} m/s", remedy="use more than 0, at most 100")
         numbers = [each.id for each in self.templates]
         if len(set(numbers)) < len(numbers):
             raise ConfigError("robots.templates: an id is given twice", remedy="give each its own")
+        for name, value in (
+            ("sender_hz", self.sender_hz),
+            ("repeat_s", self.repeat_s),
+            ("timesync_s", self.timesync_s),
+        ):
+            if not (math.isfinite(value) and value >= 0):
+                raise ConfigError(f"robots.{name} {value:g}", remedy="use 0 or more")
+        if not 1 <= self.mission_items <= MAX_MISSION:
+            raise ConfigError(f"robots.mission_items {self.mission_items}", remedy=f"use 1 to {MAX_MISSION}")
         if not 1 <= self.system_id <= MAX_SYSTEM:
             raise ConfigError(f"robots.system_id {self.system_id} is not a MAVLink system id", remedy="use 1 to 255")
 
 
 def read_remote(url: str, *, listens: bool) -> Remote:
-    """Split `udp://host:port` or `tcp://host:port`; ConfigError with the remedy for anything else."""
-    parts = urlsplit(url)
+    """Split `udp://host:port`, `tcp://host:port` or `serial:/dev/name:baud`; ConfigError with the remedy otherwise."""
+    problem = ConfigError(
+        f"MAVLink address {url[:200]!r} is not understood",
+        remedy="write udp://host:port or tcp://host:port, or serial:/dev/name:baud",
+    )
+    if url.startswith("serial:"):
+        device, _, baud = url.removeprefix("serial:").rpartition(":")
+        if not device.startswith("/") or not baud.isascii() or not baud.isdecimal():
+            raise problem
+        return Remote("serial", device, int(baud), False)
     try:
+        parts = urlsplit(url)
         port = parts.port
     except ValueError:
-        port = None
+        raise problem from None
     if parts.scheme not in ("udp", "tcp") or not parts.hostname or port is None or parts.path not in ("", "/"):
-        raise ConfigError(
-            f"MAVLink address {url!r} is not understood", remedy="write udp://host:port or tcp://host:port"
-        )
+        raise problem
     return Remote("udp" if parts.scheme == "udp" else "tcp", parts.hostname, port, listens)
 
 

@@ -1,4 +1,4 @@
-"""What robots can be told: the verbs of `robot/{id}/command`, their arguments, and what makes a way allowed.
+"""What robots can be told: the verbs of `robot/{id}/command` and their arguments.
 
 One vocabulary for MAVLink vehicles and Zenoh robots, so that a skill handler need not know which it drives.
 Arguments are checked here before anything moves; unknown ones are refused, since a misspelt `altitude` that is
@@ -7,13 +7,12 @@ silently ignored is an accident. Pure.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Struct
 
-from appliance.model import Failure, Pose, Site
-from appliance.robots.geo import MAX_EXTENT_M, blocked_leg
+from appliance.model import Failure
 
 MAX_WAYPOINTS = 100
 MAX_FRAMES = 240
@@ -38,7 +37,7 @@ class Waypoint(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NoArgs(Struct, frozen=True, forbid_unknown_fields=True):
-    """`state`, `land`, `return_home`, `arm`, `disarm`."""
+    """`state`, `land`, `return_home`, `arm`, `disarm`, `release`."""
 
 
 class GotoArgs(Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,15 +54,137 @@ class TakeoffArgs(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HoldArgs(Struct, frozen=True, forbid_unknown_fields=True):
-    """`hold`: stop where it is; ends at once, or after `duration_s` of staying."""
+    """`hold`: stop where it is; ends at once, or after `duration_s` of staying. `why` is told to what it ends."""
 
     duration_s: float | None = None
+    why: str = ""
 
 
 class StopArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`stop`: end the command of that id (none given: all) with failure `cancelled`, and hold position."""
 
     id: str | None = None
+    why: str = ""
+
+
+class MissionStep(Struct, frozen=True, forbid_unknown_fields=True):
+    """A point of a mission: stay there `hold_s`, then take a picture, or shut or open the gripper."""
+
+    x: float
+    y: float
+    z: float | None = None
+    hold_s: float = 0.0
+    act: Literal["", "photo", "grab", "release"] = ""
+
+
+class MissionArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`mission`: steps in order, then `end`. `resume`: go on with the same mission where it was left."""
+
+    steps: tuple[MissionStep, ...]
+    speed_mps: float | None = None
+    end: Literal["hold", "return", "land"] = "hold"
+    resume: bool = True
+
+
+class OrbitArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`orbit`: circle round a point; a negative radius goes counter-clockwise."""
+
+    x: float
+    y: float
+    z: float | None = None
+    radius_m: float = 5.0
+    laps: float = 1.0
+    speed_mps: float | None = None
+
+
+class ModeArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`set_mode`: the autopilot's mode by name."""
+
+    mode: str
+
+
+class ParameterArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`parameter`: read one of the autopilot's parameters, or write it where a value is given."""
+
+    name: str
+    value: float | None = None
+
+
+class TriggerArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`trigger`: take pictures with the camera on board, which keeps them."""
+
+    count: int = 1
+    interval_s: float = 1.0
+
+
+class VideoArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`video`: start or stop the camera's recording on board."""
+
+    action: Literal["start", "stop"]
+
+
+class GripperArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`gripper`: grab or release; instances count from 1."""
+
+    action: Literal["grab", "release"]
+    instance: int = 1
+
+
+class GimbalArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`gimbal`: to angles in degrees (pitch up, yaw clockwise from the nose), or at a point of the site."""
+
+    pitch_deg: float | None = None
+    yaw_deg: float | None = None
+    x: float | None = None
+    y: float | None = None
+    z: float = 0.0
+
+
+class ServoArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`servo`: an output of the autopilot (1 to 16) to a pulse width in microseconds."""
+
+    output: int
+    pwm_us: int
+
+
+class SayArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`say`: words for people about, or a tune (MML, as PLAY_TUNE takes it), or both."""
+
+    text: str = ""
+    tune: str = ""
+
+
+class AskArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`ask`: a question to somebody near by; `to` is their name, empty for whoever is nearest."""
+
+    question: str
+    to: str = ""
+
+
+class NamedArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`open`, `close`, `switch_on`, `switch_off`: what is meant, by name."""
+
+    object: str
+
+
+class GiveArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`give`: the held object to a person, or another robot, within reach."""
+
+    object: str
+    to: str
+
+
+class VelocityArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`velocity`: move by hand for a moment, as seen from the robot; repeated, each takes the place of the last.
+
+    After `for_s` it holds by itself: whoever moves it must go on saying so. `turn_dps` is to the right.
+    """
+
+    forward_mps: float = 0.0
+    left_mps: float = 0.0
+    up_mps: float = 0.0
+    turn_dps: float = 0.0
+    for_s: float = 0.5
 
 
 class PickArgs(Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,6 +222,7 @@ _ARGS: dict[str, type[Struct]] = {
     "takeoff": TakeoffArgs,
     "land": NoArgs,
     "hold": HoldArgs,
+    "velocity": VelocityArgs,
     "return_home": NoArgs,
     "arm": NoArgs,
     "disarm": NoArgs,
@@ -109,6 +231,23 @@ _ARGS: dict[str, type[Struct]] = {
     "capture": CaptureArgs,
     "record": RecordArgs,
     "stop": StopArgs,
+    "mission": MissionArgs,
+    "orbit": OrbitArgs,
+    "set_mode": ModeArgs,
+    "parameter": ParameterArgs,
+    "release": NoArgs,
+    "trigger": TriggerArgs,
+    "video": VideoArgs,
+    "gripper": GripperArgs,
+    "gimbal": GimbalArgs,
+    "servo": ServoArgs,
+    "say": SayArgs,
+    "ask": AskArgs,
+    "open": NamedArgs,
+    "close": NamedArgs,
+    "switch_on": NamedArgs,
+    "switch_off": NamedArgs,
+    "give": GiveArgs,
 }
 
 A = TypeVar("A", bound=Struct)
@@ -133,50 +272,6 @@ def in_range(verb: str, name: str, value: float | None, low: float, high: float)
     """Raise RobotFailure `payload` unless `value` is None or a number from `low` to `high`."""
     if value is not None and not (math.isfinite(value) and low <= value <= high):
         raise RobotFailure("payload", f"{verb}: {name} {value:g} is not in {low:g} to {high:g}")
-
-
-def check_way(site: Site, start: Pose, goto: GotoArgs, *, flies: bool) -> tuple[Waypoint, ...]:
-    """Return the waypoints of an allowed way; RobotFailure with the reason otherwise.
-
-    Forbidden areas bind all robots, obstacles those on the ground: a planner has gone round them before, this is
-    the last gate. Altitude and speed limits are the site's.
-    """
-    points = goto.waypoints
-    if not 1 <= len(points) <= MAX_WAYPOINTS:
-        raise RobotFailure("payload", f"goto: {len(points)} waypoints, 1 to {MAX_WAYPOINTS} are possible")
-    for number, point in enumerate(points, start=1):
-        for value in (point.x, point.y, point.z or 0.0):
-            if not math.isfinite(value) or abs(value) > MAX_EXTENT_M:
-                raise RobotFailure("payload", f"goto: waypoint {number} is not within {MAX_EXTENT_M:g} m of the origin")
-        if (point.z or 0.0) > site.altitude_limit_m:
-            raise RobotFailure(
-                "refused",
-                f"waypoint {number} is {point.z:g} m up, the site allows {site.altitude_limit_m:g} m",
-                remedy="choose a lower altitude",
-            )
-    check_speed(site, goto.speed_mps)
-    closed = site.forbidden if flies else (*site.forbidden, *site.obstacles)
-    blocked = blocked_leg(closed, (start.x, start.y), [(point.x, point.y) for point in points])
-    if blocked is not None:
-        index, box = blocked
-        raise RobotFailure(
-            "refused", f"the leg to waypoint {index + 1} goes through {box.name}", remedy="plan a way round it"
-        )
-    return points
-
-
-def check_speed(site: Site, speed_mps: float | None) -> None:
-    """Raise RobotFailure unless the speed is None, or above 0 and within the site's limit."""
-    if speed_mps is None:
-        return
-    if not math.isfinite(speed_mps) or speed_mps <= 0.0:
-        raise RobotFailure("payload", f"goto: a speed of {speed_mps:g} m/s gets nowhere")
-    if speed_mps > site.speed_limit_mps:
-        raise RobotFailure(
-            "refused",
-            f"{speed_mps:g} m/s is above the site's limit of {site.speed_limit_mps:g} m/s",
-            remedy="choose a lower speed",
-        )
 
 
 def cruise(points: Sequence[Waypoint], altitude_m: float) -> tuple[tuple[float, float, float], ...]:

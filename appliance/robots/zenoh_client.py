@@ -64,6 +64,27 @@ class ZenohTaskClient:
         record = self._ask(f"robot/{self._robot}/task", {"instruction": instruction, "id": task}, timeout_s)
         return str(record["id"])
 
+    def register(
+        self,
+        *,
+        uses: tuple[str, ...] = (),
+        verbs: tuple[str, ...] = (),
+        flies: bool = False,
+        limits: dict[str, float] | None = None,
+    ) -> "Registration":
+        """Make the robot known to the fleet, with what it can do; it is there until closed, or until it is cut off.
+
+        Args:
+            uses: actuators and sensors it has: base, arm, camera, ...
+            verbs: commands that it answers on `robot/{robot}/command` (docs/robots.md).
+            flies: whether it does.
+            limits: `speed_mps`, `altitude_m`, `payload_kg`, `range_m`, as far as known.
+        """
+        info: Record = {"id": self._robot, "kind": "zenoh", "uses": uses, "verbs": verbs, "flies": flies}
+        if limits:
+            info["limits"] = limits
+        return Registration(self._session, f"{self._root}/robot/{self._robot}", info)
+
     def follow(self, task: str, *, timeout_s: float = 3600.0) -> Iterator[Record]:
         """Yield a task's record whenever it changes, until it ends; TimeoutError when it does not by then."""
         until = time.monotonic() + timeout_s
@@ -112,6 +133,29 @@ class ZenohTaskClient:
         raise TimeoutError("no gateway answered; asking again with the same id is safe")
 
 
+class Registration:
+    """A robot as the fleet knows it: its liveliness token says that it is there, its state what it is and where."""
+
+    def __init__(self, session: Any, key: str, info: Record) -> None:
+        self._session = session
+        self._key = f"{key}/state"
+        self._info = info
+        # Kept here: a token that nobody holds is taken back by the garbage collector.
+        self._token: Any = session.liveliness().declare_token(f"{key}/alive")
+        self.update()
+
+    def update(self, **state: Any) -> None:
+        """Tell its state: fields of RobotInfo such as `pose`, `battery_percent`, `mode`; some times a second."""
+        self._info |= state
+        self._session.put(self._key, json.dumps(self._info).encode(), encoding="application/json")
+
+    def close(self) -> None:
+        """Leave the fleet."""
+        if self._token is not None:
+            self._token.undeclare()
+            self._token = None
+
+
 class AsyncZenohTaskClient:
     """The same for asyncio; arguments as `ZenohTaskClient`. Waiting is done in threads."""
 
@@ -121,6 +165,10 @@ class AsyncZenohTaskClient:
     async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0) -> str:
         """As `ZenohTaskClient.submit`."""
         return await asyncio.to_thread(self._client.submit, instruction, task=task, timeout_s=timeout_s)
+
+    async def register(self, **what: Any) -> Registration:
+        """As `ZenohTaskClient.register`."""
+        return await asyncio.to_thread(self._client.register, **what)
 
     async def follow(self, task: str, *, timeout_s: float = 3600.0) -> AsyncIterator[Record]:
         """As `ZenohTaskClient.follow`."""
@@ -132,6 +180,6 @@ class AsyncZenohTaskClient:
 def _table(data: bytes) -> Record:
     try:
         value = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return cast("Record", value) if isinstance(value, dict) else {}

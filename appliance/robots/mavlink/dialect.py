@@ -1,47 +1,29 @@
-"""The one place that touches pymavlink: frames to messages and messages to frames, and the numbers used here.
+"""Encoder and decoder of a link, and MAVLink's numbers by their names.
 
 `ardupilotmega` includes `common`, so one dialect serves ArduPilot and every message of PX4 that is used here. The
 generated classes are untyped in practice (fields appear by name), so the rest of the room sees `Frame`.
-pymavlink's stream parser is not used: it resynchronises across datagrams and hides what it drops, and a gateway
-must count each damaged frame and keep the raw bytes of each good one. Its decoder and encoder are.
 """
 
 from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
-from msgspec import Struct
 from pymavlink.dialects.v20 import ardupilotmega as _dialect
 
+from appliance.robots.mavlink.frames import (
+    MARKER_V1,
+    MARKER_V2,
+    Damage,
+    Frame,
+    as_v2,
+    check,
+    frame_length,
+    marked,
+    next_marker,
+)
+from appliance.robots.mavlink.kinds import CommandCancel, Message
 from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG, Signer, wall_ticks
 
-MARKER_V2 = 0xFD
-MARKER_V1 = 0xFE
-_HEADER_V2, _HEADER_V1, _CHECKSUM = 10, 6, 2
-
-Message = Any
-"""A pymavlink message: fields by name."""
-
-
-class Frame(Struct, frozen=True, kw_only=True):
-    """A frame whose checksum was right: who sent it, which message (`HEARTBEAT`, ...), its fields, its bytes."""
-
-    system: int
-    component: int
-    sequence: int
-    name: str
-    message: Message
-    raw: bytes
-
-
-class Damage(Struct, frozen=True):
-    """Bytes that made no frame, or one that is not believed.
-
-    `checksum`, `unknown_message`, `truncated`, `incompatible`, `noise`; `signed` (there is no key here), `unsigned`,
-    `bad_signature`, `replayed`.
-    """
-
-    kind: str
-    length: int
+__all__ = ["Codec", "Damage", "Frame", "Message", "Stream", "constant", "frame_length", "label", "make"]
 
 
 class Codec:
@@ -67,7 +49,7 @@ class Codec:
         self._mav.srcSystem = self.system if system is None else system
         raw = bytes(message.pack(self._mav))
         if self.signer is not None:
-            raw = self._sign(raw, message)
+            raw = self._sign(raw, raw[7] | raw[8] << 8 | raw[9] << 16)
         self._mav.seq = (self._mav.seq + 1) % 256
         return raw
 
@@ -75,16 +57,16 @@ class Codec:
         """Return a frame of another link as this one sends it: its bytes, signed or unsigned as this link is."""
         raw = frame.raw
         if self.signer is not None:
-            return self._sign(_as_v2(raw), frame.message)
+            return self._sign(as_v2(raw), frame.number)
         if raw[0] == MARKER_V2 and raw[2] & SIGNED_FLAG:
-            return _reframed(raw[:-SIGNATURE_BYTES], frame.message, signed=False)
+            return marked(raw[:-SIGNATURE_BYTES], frame.number, signed=False)
         return raw
 
-    def _sign(self, raw: bytes, message: Message) -> bytes:
+    def _sign(self, raw: bytes, number: int) -> bytes:
         assert self.signer is not None  # noqa: S101 - only called with one
         if raw[2] & SIGNED_FLAG:
             raw = raw[:-SIGNATURE_BYTES]
-        frame = _reframed(raw, message, signed=True)
+        frame = marked(raw, number, signed=True)
         return frame + self.signer.signature(frame, self.signer.stamp(self._clock()))
 
     def read(self, data: bytes, *, more: bool = False) -> Generator[Frame | Damage, None, int]:
@@ -103,7 +85,7 @@ class Codec:
         at = 0
         while at < len(data):
             if data[at] not in (MARKER_V2, MARKER_V1):
-                following = _next_marker(data, at + 1)
+                following = next_marker(data, at + 1)
                 yield Damage("noise", following - at)
                 at = following
                 continue
@@ -111,7 +93,7 @@ class Codec:
             if length is None or at + length > len(data):
                 if more:
                     return at
-                following = _next_marker(data, at + 1)
+                following = next_marker(data, at + 1)
                 yield Damage("truncated", following - at)
                 at = following
                 continue
@@ -125,47 +107,33 @@ class Codec:
 
     def _resume(self, data: bytes, at: int, length: int, *, more: bool) -> int:
         """Return where to go on after a damaged frame of that announced length."""
-        inner = _next_marker(data, at + 1)
+        inner = next_marker(data, at + 1)
         while inner < at + length:
             size = frame_length(data, inner)
             if size is None or inner + size > len(data):
                 if more:
                     return inner  # may become a frame
-            elif isinstance(self._decode(data[inner : inner + size]), Frame):
+            elif isinstance(check(data[inner : inner + size]), Frame):  # its signature is looked at once, when read
                 return inner
-            inner = _next_marker(data, inner + 1)
+            inner = next_marker(data, inner + 1)
         behind = at + length
         return behind if behind == len(data) or data[behind] in (MARKER_V1, MARKER_V2) else inner
 
     def _decode(self, raw: bytes) -> Frame | Damage:
-        if raw[0] == MARKER_V2 and raw[2] & ~SIGNED_FLAG:
-            return Damage("incompatible", len(raw))
-        try:
-            message: Message = self._mav.decode(bytearray(raw))
-        except _dialect.MAVError:
-            return Damage("checksum", len(raw))
-        if isinstance(message, _dialect.MAVLink_unknown):
-            return Damage("unknown_message", len(raw))
-        header: Any = message.get_header()
-        if problem := self._unproven(raw, header.srcSystem, header.srcComponent, message):
+        found = check(raw)
+        if isinstance(found, Frame) and (problem := self._unproven(found)):
             return Damage(problem, len(raw))
-        return Frame(
-            system=header.srcSystem,
-            component=header.srcComponent,
-            sequence=header.seq,
-            name=message.get_type(),
-            message=message,
-            raw=raw,
-        )
+        return found
 
-    def _unproven(self, raw: bytes, system: int, component: int, message: Message) -> str:
+    def _unproven(self, frame: Frame) -> str:
         """Return why a frame whose checksum is right is not believed; empty when it is."""
+        raw = frame.raw
         if self.signer is None:
             # No key is shared with this link's vehicles: a signature proves nothing and may be of another's making.
             return "signed" if raw[0] == MARKER_V2 and raw[2] & SIGNED_FLAG else ""
-        problem = self.signer.problem(raw, system=system, component=component, now=self._clock())
+        problem = self.signer.problem(raw, system=frame.system, component=frame.component, now=self._clock())
         # A radio's own account of the link is made by the radio, which has no key (guide: Message Signing).
-        return "" if problem == "unsigned" and message.get_type() == "RADIO_STATUS" else problem
+        return "" if problem == "unsigned" and frame.name == "RADIO_STATUS" else problem
 
 
 class Stream:
@@ -187,39 +155,10 @@ class Stream:
         self._rest = data[used:]
 
 
-def _reframed(raw: bytes, message: Message, *, signed: bool) -> bytes:
-    """Return an unsigned MAVLink 2 frame with the header saying (not) signed; the checksum covers the header."""
-    body = bytearray(raw[:-_CHECKSUM])
-    body[2] = body[2] | SIGNED_FLAG if signed else body[2] & ~SIGNED_FLAG
-    checksum: int = _dialect.x25crc(bytes(body[1:]) + bytes([message.crc_extra])).crc
-    return bytes(body) + checksum.to_bytes(2, "little")
-
-
-def _as_v2(raw: bytes) -> bytes:
-    """Return a MAVLink 1 frame as one of MAVLink 2 with room for the checksum; others as they are."""
-    if raw[0] != MARKER_V1:
-        return raw
-    length, sequence, system, component, number = raw[1:6]
-    header = bytes((MARKER_V2, length, 0, 0, sequence, system, component, number, 0, 0))
-    return header + raw[_HEADER_V1:]
-
-
-def frame_length(data: bytes, at: int) -> int | None:
-    """Return the length that the header at `at` announces, None when the header is not whole."""
-    if len(data) - at < 3:
-        return None
-    if data[at] == MARKER_V1:
-        return _HEADER_V1 + data[at + 1] + _CHECKSUM
-    return _HEADER_V2 + data[at + 1] + _CHECKSUM + (SIGNATURE_BYTES if data[at + 2] & SIGNED_FLAG else 0)
-
-
-def _next_marker(data: bytes, start: int) -> int:
-    found = [place for place in (data.find(MARKER_V2, start), data.find(MARKER_V1, start)) if place >= 0]
-    return min(found, default=len(data))
-
-
 def make(name: str, **fields: Any) -> Message:
     """Make a message by its MAVLink name, such as `make("HEARTBEAT", type=..., ...)`."""
+    if name == CommandCancel.name:
+        return CommandCancel(**fields)
     kind: Any = getattr(_dialect, f"MAVLink_{name.lower()}_message")
     return kind(**fields)
 
@@ -244,6 +183,18 @@ WAYPOINT = constant("MAV_CMD_NAV_WAYPOINT")
 SET_MODE = constant("MAV_CMD_DO_SET_MODE")
 CHANGE_SPEED = constant("MAV_CMD_DO_CHANGE_SPEED")
 MISSION_START = constant("MAV_CMD_MISSION_START")
+RUN_PREARM = constant("MAV_CMD_RUN_PREARM_CHECKS")
+SET_CURRENT = constant("MAV_CMD_DO_SET_MISSION_CURRENT")
+LOITER_TURNS = constant("MAV_CMD_NAV_LOITER_TURNS")
+IMAGE_START = constant("MAV_CMD_IMAGE_START_CAPTURE")
+VIDEO_START = constant("MAV_CMD_VIDEO_START_CAPTURE")
+VIDEO_STOP = constant("MAV_CMD_VIDEO_STOP_CAPTURE")
+GRIPPER = constant("MAV_CMD_DO_GRIPPER")
+GIMBAL_ANGLES = constant("MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW")
+LOOK_AT = constant("MAV_CMD_DO_SET_ROI_LOCATION")
+SERVO = constant("MAV_CMD_DO_SET_SERVO")
+GET_HOME = constant("MAV_CMD_GET_HOME_POSITION")
+CAPABILITIES = constant("MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES")
 REQUEST_MESSAGE = constant("MAV_CMD_REQUEST_MESSAGE")
 SET_INTERVAL = constant("MAV_CMD_SET_MESSAGE_INTERVAL")
 
@@ -269,15 +220,21 @@ AUTOPILOT_NONE = constant("MAV_AUTOPILOT_INVALID")
 TYPE_GROUND_STATION = constant("MAV_TYPE_GCS")
 TYPE_ONBOARD = constant("MAV_TYPE_ONBOARD_CONTROLLER")
 TYPE_QUADROTOR = constant("MAV_TYPE_QUADROTOR")
+TYPE_ROVER = constant("MAV_TYPE_GROUND_ROVER")
+TYPE_CAMERA = constant("MAV_TYPE_CAMERA")
+TYPE_GIMBAL = constant("MAV_TYPE_GIMBAL")
 MULTIROTORS = frozenset(
     constant(f"MAV_TYPE_{name}")
     for name in ("QUADROTOR", "HEXAROTOR", "OCTOROTOR", "TRICOPTER", "COAXIAL", "HELICOPTER", "DODECAROTOR")
 )
 COMPONENT_AUTOPILOT = constant("MAV_COMP_ID_AUTOPILOT1")
+COMPONENT_CAMERA = constant("MAV_COMP_ID_CAMERA")
+COMPONENT_GIMBAL = constant("MAV_COMP_ID_GIMBAL")
 ARMED_FLAG = constant("MAV_MODE_FLAG_SAFETY_ARMED")
 CUSTOM_MODE_FLAG = constant("MAV_MODE_FLAG_CUSTOM_MODE_ENABLED")
 STATE_ACTIVE = constant("MAV_STATE_ACTIVE")
 STATE_STANDBY = constant("MAV_STATE_STANDBY")
+STATE_CRITICAL = constant("MAV_STATE_CRITICAL")
 
 COPTER_MODES: dict[str, int] = {
     "STABILIZE": 0,

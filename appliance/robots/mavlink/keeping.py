@@ -1,7 +1,7 @@
 """What signed links know, kept in the store: after a restart nothing old is believed and no time used twice."""
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import msgspec
 import structlog
@@ -15,15 +15,18 @@ from appliance.robots.settings import MavlinkLink
 log = structlog.get_logger(__name__)
 
 REMEMBER_S = 5.0
-"""How often it is kept; what a crash forgets may be replayed within a minute."""
+"""How often it is kept; `signing.AHEAD` and `signing.SINCE` are longer."""
 
 
 def _key(link: MavlinkLink) -> str:
     return f"mavlink/signing/{link.remote}"
 
 
-async def load_signer(link: MavlinkLink, index: int, store: KeyValues) -> Signer | None:
-    """Return the key of a link with what it knew before; None for a link that does not sign. ConfigError: no key."""
+async def load_signer(link: MavlinkLink, number: int, store: KeyValues) -> Signer | None:
+    """Return the key of a link with what it knew before; None for a link that does not sign. ConfigError: no key.
+
+    From then on the time kept is ahead of what is used, so that a crash at any moment makes none be used twice.
+    """
     if not link.signing:
         return None
     key = await asyncio.to_thread(read_key, link.signing)
@@ -33,11 +36,14 @@ async def load_signer(link: MavlinkLink, index: int, store: KeyValues) -> Signer
     except msgspec.DecodeError as error:
         log.warning("what a signed link knew is lost", link=str(link.remote), reason=str(error))
         memory = Memory()
-    return Signer(key, link_id=index % 256, memory=memory)
+    signer = Signer(key, link_id=number % 256, memory=memory)
+    await store.put(_key(link), encode(signer.ahead))
+    return signer
 
 
-async def remember(links: Sequence[Link], settings: Sequence[MavlinkLink], store: KeyValues) -> None:
-    """Keep what the signed links know."""
-    for link, setting in zip(links, settings, strict=False):
-        if link.codec.signer is not None:
-            await store.put(_key(setting), encode(link.codec.signer.memory))
+async def remember(links: Iterable[tuple[MavlinkLink, Link]], store: KeyValues, *, last: bool = False) -> None:
+    """Keep what the signed links know; `last`: nothing more is sent or heard, so it is exact."""
+    for setting, link in links:
+        signer = link.codec.signer
+        if signer is not None:
+            await store.put(_key(setting), encode(signer.memory if last else signer.ahead))

@@ -10,24 +10,26 @@ and back:
 
     {"op": "accepted", "id", "state"}                       durable on its replicas
     {"op": "rejected", "id", "code", "message", "remedy", "retry"}
-    {"op": "news", "id", "state", "done", "total", "message"}   on each change, until a final state
+    {"op": "news", "id", "state", "done", "total", "message"}   on each change, until a final state; then also
+                                                            "results", by subtask, as far as 8 KiB hold them
 """
 
 import asyncio
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import structlog
-from msgspec import Struct
+from msgspec import Struct, field
 
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest, encode
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message
+from appliance.robots.mavlink.requests import STATION
 from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel, NotDelivered
 
 log = structlog.get_logger(__name__)
@@ -38,6 +40,8 @@ MAX_AT_WORK = 16
 """Messages being carried out at once."""
 MAX_FOLLOWED = 1000
 """Tasks whose senders are told how they go on; the oldest is forgotten first."""
+MOST_RESULTS = 8 * 1024
+"""Bytes of results that are told; what is larger is looked up by the task's id."""
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
 
 
@@ -61,13 +65,15 @@ class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
     message: str = ""
     remedy: str = ""
     retry: bool = False
+    results: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
 
 
 class _Sender:
     """One other end."""
 
-    def __init__(self, name: str, reply: Callable[[Message], None]) -> None:
-        self.name = name
+    def __init__(self, reply: Callable[[Message], None]) -> None:
+        self.name = ""
+        """Whose its tasks are: the vehicle that speaks, not one that it addresses."""
         self.reply = reply
         self.channel = Channel(lambda: secrets.randbits(32))
 
@@ -96,17 +102,18 @@ class LetterDesk:
             task.cancel()
         await asyncio.gather(*self._at_work, return_exceptions=True)
 
-    def take(self, frame: Frame, *, robot: str, reply: Callable[[Message], None]) -> None:
+    def take(self, frame: Frame, *, asker: str = "", reply: Callable[[Message], None]) -> None:
         """Take a TUNNEL frame of this protocol that is for this gateway; arguments as `RequestDesk.take`."""
         message = frame.message
         key = (frame.system, frame.component)
         sender = self._senders.get(key)
         if sender is None:
-            sender = self._senders[key] = _Sender(robot or f"mavlink-{frame.system}-{frame.component}", reply)
+            sender = self._senders[key] = _Sender(reply)
             while len(self._senders) > MAX_SENDERS:
                 self._senders.popitem(last=False)
         self._senders.move_to_end(key)
         sender.reply = reply
+        sender.name = asker or f"{STATION}{frame.system}-{frame.component}"
         payload = bytes(message.payload[: min(message.payload_length, MAX_PAYLOAD)])
         before = sender.channel.malformed
         whole = sender.channel.take(payload, self._clock())
@@ -179,7 +186,7 @@ class LetterDesk:
                 record = await self._tasks.submit(request)
                 log.info("task by MAVLink", task=record.id, sender=sender.name, instruction=letter.instruction[:200])
             elif letter.op == "cancel":
-                record = await self._tasks.cancel(letter.id)
+                record = await self._tasks.cancel(letter.id, sender.name)
             else:
                 record = await self._tasks.look(letter.id)
         except SwiftbotError as error:
@@ -218,6 +225,13 @@ class LetterDesk:
 
 
 def _news(record: TaskRecord) -> Answer:
+    results: dict[str, dict[str, Any]] = {}
+    if record.state.final:
+        left = MOST_RESULTS
+        for each in record.subtasks:
+            left -= len(encode(each.result)) if each.result else 0
+            if each.result and left >= 0:
+                results[each.subtask.id] = each.result
     return Answer(
         op="news",
         id=record.id,
@@ -225,4 +239,5 @@ def _news(record: TaskRecord) -> Answer:
         done=sum(each.state.final for each in record.subtasks),
         total=len(record.subtasks),
         message=record.failure.message[:1000] if record.failure else "",
+        results=results,
     )

@@ -1,12 +1,12 @@
-"""MAVLink's two acknowledged exchanges: commands, and the upload of a mission.
+"""MAVLink's acknowledged exchanges: commands, and missions up and down.
 
-Both are made for links that lose a fifth of what is sent: whatever is not answered in time is sent again, a
+They are made for links that lose a fifth of what is sent: whatever is not answered in time is sent again, a
 bounded number of times, and what arrives late or twice is recognised (mavlink.io: Command Protocol, Mission
 Protocol).
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import structlog
 from msgspec import Struct
@@ -18,8 +18,12 @@ from appliance.robots.verbs import RobotFailure
 
 log = structlog.get_logger(__name__)
 
+MAX_ITEMS = 1000
+"""Of a mission that is read."""
 _PROGRESS_S = 30.0
 """How long a command may stay IN_PROGRESS without a word."""
+_WORDS_S = 0.3
+"""How long to wait for the words that explain a refusal, where none came before it."""
 
 
 class Patience(Struct, frozen=True, kw_only=True):
@@ -38,42 +42,190 @@ class Item(Struct, frozen=True, kw_only=True):
     relative_m: float = 0.0
     parameters: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
+    def same(self, other: "Item") -> bool:
+        """Whether an autopilot that keeps positions to 1e-7 degrees and the rest as floats holds this item."""
+        return (
+            self.command == other.command
+            and abs(self.latitude_deg - other.latitude_deg) < 2e-7
+            and abs(self.longitude_deg - other.longitude_deg) < 2e-7
+            and abs(self.relative_m - other.relative_m) < 0.02
+            and all(abs(one - two) < 0.01 for one, two in zip(self.parameters, other.parameters, strict=True))
+        )
 
-async def command(vehicle: Vehicle, number: int, *parameters: float, patience: Patience) -> None:
+
+class Outcome(Struct, frozen=True, kw_only=True):
+    """How a command was answered: MAV_RESULT, COMMAND_ACK.result_param2, and what the vehicle said meanwhile."""
+
+    result: int
+    number: int = 0
+    said: tuple[str, ...] = ()
+
+
+def _always() -> None:
+    pass
+
+
+async def command(
+    vehicle: Vehicle,
+    number: int,
+    *parameters: float,
+    patience: Patience,
+    component: int | None = None,
+    check: Callable[[], None] = _always,
+) -> Outcome:
     """Send COMMAND_LONG until it is acknowledged.
+
+    Args:
+        vehicle: whose.
+        number: MAV_CMD.
+        parameters: up to seven.
+        patience: how long and how often.
+        component: another than the autopilot.
+        check: called right before each sending, repeats too; raises RobotFailure when it may not be sent any more.
 
     Raises:
         RobotFailure: `robot` when the vehicle declines (with its own words where it gave some), or, retryable,
-            when no acknowledgement came after all tries.
+            when no acknowledgement came after all tries; what `check` raises.
     """
+    outcome = await ask(vehicle, number, *parameters, patience=patience, component=component, check=check)
+    return accepted(vehicle, number, outcome)
+
+
+async def ask(
+    vehicle: Vehicle,
+    number: int,
+    *parameters: float,
+    patience: Patience,
+    component: int | None = None,
+    check: Callable[[], None] = _always,
+) -> Outcome:
+    """Send COMMAND_LONG as `command` does, and return whatever it is answered with."""
     values = (*parameters, *([0.0] * 7))[:7]
-    name = label("MAV_CMD", number)
+    target = vehicle.component if component is None else component
+    fields = {f"param{index + 1}": value for index, value in enumerate(values)}
+
+    def build(confirmation: int) -> Message:
+        return make(
+            "COMMAND_LONG",
+            target_system=vehicle.system,
+            target_component=target,
+            command=number,
+            confirmation=min(confirmation, 255),
+            **fields,
+        )
+
+    return await _exchange(vehicle, build, number, target, patience, check)
+
+
+async def command_at(
+    vehicle: Vehicle,
+    number: int,
+    *parameters: float,
+    at: tuple[float, float, float],
+    patience: Patience,
+    component: int | None = None,
+    frame: int = dialect.FRAME_RELATIVE,
+) -> Outcome:
+    """Send COMMAND_INT, which carries a position without the rounding of COMMAND_LONG's floats.
+
+    Args:
+        vehicle: whose.
+        number: MAV_CMD.
+        parameters: the first four.
+        at: latitude and longitude in degrees, altitude in metres in `frame`.
+        patience: how long and how often.
+        component: another than the autopilot.
+        frame: MAV_FRAME.
+
+    Raises:
+        RobotFailure: as `command`.
+    """
+    one, two, three, four = (*parameters, *([0.0] * 4))[:4]
+    target = vehicle.component if component is None else component
+    latitude, longitude, altitude = at
+
+    def build(_: int) -> Message:
+        return make(
+            "COMMAND_INT",
+            target_system=vehicle.system,
+            target_component=target,
+            frame=frame,
+            command=number,
+            current=0,
+            autocontinue=0,
+            param1=one,
+            param2=two,
+            param3=three,
+            param4=four,
+            x=round(latitude * 1e7),
+            y=round(longitude * 1e7),
+            z=altitude,
+        )
+
+    return accepted(vehicle, number, await _exchange(vehicle, build, number, target, patience))
+
+
+async def _exchange(
+    vehicle: Vehicle,
+    build: Callable[[int], Message],
+    number: int,
+    component: int,
+    patience: Patience,
+    check: Callable[[], None] = _always,
+) -> Outcome:
+    """Send a command until it is answered; RobotFailure, retryable, when it never is."""
+    loop = asyncio.get_running_loop()
     async with vehicle.exchange, vehicle.listening("COMMAND_ACK") as answers:
         vehicle.text = ""
+        began = loop.time()
         for attempt in range(patience.tries):
-            vehicle.send(_long(vehicle, number, values, confirmation=attempt))
-            result = await _acknowledgement(answers, number, patience.timeout_s)
-            if result is None:
+            check()
+            vehicle.send(build(attempt))
+            answer = await _acknowledgement(vehicle, answers, number, component, patience.timeout_s)
+            if answer is None:
                 continue
-            if result == dialect.ACCEPTED:
-                return
-            said = f": {vehicle.text}" if vehicle.text else ""
-            raise RobotFailure(
-                "robot",
-                f"{vehicle.name} answered {name} with {label('MAV_RESULT', result).removeprefix('MAV_RESULT_')}{said}",
-                remedy="look at the vehicle's messages",
-                retryable=result == dialect.TEMPORARILY_REJECTED,
-            )
+            result = int(answer.result)
+            if result != dialect.ACCEPTED and not vehicle.texts.since(began, loop.time()):
+                # Some autopilots give the reason after the refusal.
+                await asyncio.sleep(_WORDS_S)
+            said = vehicle.texts.since(began, loop.time())
+            return Outcome(result=result, number=int(getattr(answer, "result_param2", 0)), said=said)
     raise RobotFailure(
         "robot",
-        f"{vehicle.name} did not acknowledge {name} in {patience.tries} tries",
+        f"{vehicle.name} did not acknowledge {label('MAV_CMD', number)} in {patience.tries} tries",
         remedy="check its radio link",
         retryable=True,
     )
 
 
-async def _acknowledgement(answers: asyncio.Queue[Message], number: int, timeout_s: float) -> int | None:
-    """Wait for the result of a command; IN_PROGRESS extends the wait."""
+def accepted(vehicle: Vehicle, number: int, outcome: Outcome) -> Outcome:
+    """Return an outcome whose result is MAV_RESULT_ACCEPTED.
+
+    Args:
+        vehicle: who answered, for the message.
+        number: MAV_CMD that was answered.
+        outcome: how.
+
+    Raises:
+        RobotFailure: `robot`, any other result, with the vehicle's words where it gave some; retryable when it was
+            TEMPORARILY_REJECTED.
+    """
+    if outcome.result == dialect.ACCEPTED:
+        return outcome
+    said = f": {'; '.join(outcome.said)}" if outcome.said else ""
+    name = label("MAV_CMD", number)
+    raise RobotFailure(
+        "robot",
+        f"{vehicle.name} answered {name} with {label('MAV_RESULT', outcome.result).removeprefix('MAV_RESULT_')}{said}",
+        remedy="look at the vehicle's messages",
+        retryable=outcome.result == dialect.TEMPORARILY_REJECTED,
+    )
+
+
+async def _acknowledgement(
+    vehicle: Vehicle, answers: asyncio.Queue[Message], number: int, component: int, timeout_s: float
+) -> Message | None:
+    """Wait for the answer to a command of ours; IN_PROGRESS extends the wait."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout_s
     while True:
@@ -82,23 +234,14 @@ async def _acknowledgement(answers: asyncio.Queue[Message], number: int, timeout
                 answer = await answers.get()
         except TimeoutError:
             return None
-        if answer.command != number:
+        if answer.command != number or answer.get_srcComponent() != component:
             continue
+        if vehicle.own and answer.target_system not in (0, vehicle.own):
+            continue  # the answer to a ground station's command of the same number
         if answer.result == dialect.IN_PROGRESS:
             deadline = loop.time() + _PROGRESS_S
             continue
-        return int(answer.result)
-
-
-def _long(vehicle: Vehicle, number: int, values: tuple[float, ...], *, confirmation: int) -> Message:
-    return make(
-        "COMMAND_LONG",
-        target_system=vehicle.system,
-        target_component=vehicle.component,
-        command=number,
-        confirmation=confirmation,
-        **{f"param{index + 1}": value for index, value in enumerate(values)},
-    )
+        return answer
 
 
 async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience) -> None:
@@ -124,7 +267,9 @@ async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience)
                 else:
                     _send_item(vehicle, items, last)
                 continue
-            if getattr(answer, "mission_type", 0) != 0:
+            if getattr(answer, "mission_type", 0) != 0 or (
+                vehicle.own and answer.target_system not in (0, vehicle.own)
+            ):
                 continue
             if answer.get_type() != "MISSION_ACK":
                 if 0 <= answer.seq < len(items):
@@ -133,11 +278,14 @@ async def upload(vehicle: Vehicle, items: Sequence[Item], *, patience: Patience)
                     last = int(answer.seq)
                     sent.add(last)
                     _send_item(vehicle, items, last)
+                else:
+                    silent += 1  # it asks for what there is not: that goes on no longer than silence
                 continue
             if answer.type == dialect.MISSION_OK:
                 if len(sent) == len(items):
                     vehicle.forget_mission()
                     return
+                silent += 1
                 continue  # late answer to an earlier upload
             if answer.type in (dialect.MISSION_SEQUENCE, dialect.MISSION_ERROR):
                 # It lost count, or had closed the transfer when a repeat came: begin again.
@@ -196,4 +344,63 @@ def _send_item(vehicle: Vehicle, items: Sequence[Item], number: int) -> None:
             z=item.relative_m,
             mission_type=0,
         )
+    )
+
+
+async def download(vehicle: Vehicle, *, patience: Patience) -> tuple[Item, ...]:
+    """Return the mission that is on board, its home included.
+
+    Raises:
+        RobotFailure: retryable, when the vehicle does not answer.
+    """
+    items: dict[int, Item] = {}
+    async with vehicle.exchange, vehicle.listening("MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ACK") as answers:
+        target = {"target_system": vehicle.system, "target_component": vehicle.component, "mission_type": 0}
+        count: int | None = None
+        silent = 0
+        while silent < patience.tries and (count is None or len(items) < count):
+            if count is None:
+                vehicle.send(make("MISSION_REQUEST_LIST", **target))
+            else:
+                vehicle.send(make("MISSION_REQUEST_INT", seq=len(items), **target))
+            answer = await _next(vehicle, answers, patience.timeout_s)
+            silent += 1
+            if answer is None:
+                continue
+            if answer.get_type() == "MISSION_COUNT" and count is None:
+                count, silent = min(int(answer.count), MAX_ITEMS), 0
+            elif answer.get_type() == "MISSION_ITEM_INT" and answer.seq == len(items):
+                items[answer.seq] = _item(answer)
+                silent = 0
+        if count is not None and len(items) == count:
+            vehicle.send(make("MISSION_ACK", type=dialect.MISSION_OK, **target))
+            return tuple(items[number] for number in range(count))
+    raise RobotFailure(
+        "robot",
+        f"{vehicle.name} did not tell its mission in {patience.tries} tries",
+        remedy="check its radio link",
+        retryable=True,
+    )
+
+
+async def _next(vehicle: Vehicle, answers: asyncio.Queue[Message], timeout_s: float) -> Message | None:
+    """Wait for a message of a mission transfer that is ours."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            while True:
+                answer = await answers.get()
+                ours = not vehicle.own or answer.target_system in (0, vehicle.own)
+                if ours and getattr(answer, "mission_type", 0) == 0:
+                    return answer
+    except TimeoutError:
+        return None
+
+
+def _item(message: Message) -> Item:
+    return Item(
+        command=int(message.command),
+        latitude_deg=message.x / 1e7,
+        longitude_deg=message.y / 1e7,
+        relative_m=float(message.z),
+        parameters=(message.param1, message.param2, message.param3, message.param4),
     )

@@ -1,4 +1,4 @@
-"""Tasks asked for by MAVLink command: MAV_CMD_USER_1 with a template's number and arguments.
+"""Tasks asked for by MAVLink command: MAV_CMD_USER_1 with a template's number and arguments, and MAV_CMD_MISSION_START.
 
 A ground station's button or a vehicle's script sends COMMAND_LONG (or COMMAND_INT) to component 191, of the gateway's
 system or of a vehicle's: param1 is the template, param2 to param7 its arguments. The answers are COMMAND_ACKs:
@@ -8,9 +8,11 @@ system or of a vehicle's: param1 is the template, param2 to param7 its arguments
     TEMPORARILY_REJECTED    the fleet takes none just now, or this sender's last one has not been answered yet
     DENIED                  it cannot be; a STATUSTEXT tells why
     UNSUPPORTED             another command
+    CANCELLED               the task is being stopped, as COMMAND_CANCEL wanted
 
-MAV_CMD_USER_2 cancels the sender's last task (pymavlink's dialects have no COMMAND_CANCEL). COMMAND_ACK answers by
-command alone, so a sender has one outstanding; a repetition (`confirmation` above 0) of the last one gets the last
+COMMAND_CANCEL stops the task that the sender asked for last by the command that it names, MAV_CMD_USER_2 whichever it
+asked for last (for ground stations whose buttons can send commands only). COMMAND_ACK answers by command alone, so a
+sender has one outstanding; a repetition (`confirmation` above 0) of the last one gets the last
 answer, also from a gateway that was restarted in between. How the task goes on is told by STATUSTEXT.
 """
 
@@ -27,16 +29,22 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import TaskRecord, TaskRequest, TaskState, encode
+from appliance.model import Plan, TaskRecord, TaskRequest, TaskState, encode
 from appliance.robots.doors import Tasks
 from appliance.robots.ledger import KeyValues
-from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink import dialect, texts
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.settings import Template
 
 log = structlog.get_logger(__name__)
 
 ASK, CANCEL = dialect.constant("MAV_CMD_USER_1"), dialect.constant("MAV_CMD_USER_2")
+MISSION = dialect.MISSION_START
+COMMAND_MESSAGES = frozenset(("COMMAND_LONG", "COMMAND_INT", "COMMAND_CANCEL"))
+CANCELLED = 6
+"""MAV_RESULT_CANCELLED, which pymavlink leaves out with COMMAND_CANCEL."""
+STATION = "mavlink-"
+"""Before system and component of who asks and is no vehicle of ours: the submitter of its tasks."""
 PREFIX = "mavlink/request/"
 """Of the senders' last requests in the gateway's store."""
 MAX_SENDERS = 64
@@ -45,9 +53,7 @@ MAX_AT_WORK = 16
 """Requests being carried out at once, of different senders."""
 MAX_FOLLOWED = 1000
 """Tasks whose senders are told how they go on; the oldest is forgotten first."""
-_TEXT = 50
-"""Characters of a STATUSTEXT."""
-_INFO, _NOTICE, _ERROR = 6, 5, 3
+_INFO, _NOTICE, _ERROR = texts.INFO, texts.NOTICE, texts.ERROR
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
 """Errors after which it may be asked again."""
 
@@ -59,6 +65,7 @@ class Asked(Struct, kw_only=True):
     task: str
     result: int | None = None
     why: str = ""
+    command: int = ASK
 
 
 class _Work(Struct, frozen=True, kw_only=True):
@@ -113,15 +120,25 @@ class RequestDesk:
         tasks: the fleet's tasks; None where this gateway takes none, which is answered so.
         store: keeps each sender's last request.
         refused: counters of bad input.
+        mission: returns the instruction and plan of a vehicle's mission, by the parameters of MISSION_START; None:
+            none are taken here.
     """
 
     def __init__(
-        self, templates: tuple[Template, ...], *, tasks: Tasks | None, store: KeyValues, refused: dict[str, int]
+        self,
+        templates: tuple[Template, ...],
+        *,
+        tasks: Tasks | None,
+        store: KeyValues,
+        refused: dict[str, int],
+        mission: Callable[[str, tuple[float, ...]], tuple[str, Plan]] | None = None,
     ) -> None:
         self._templates = {each.id: each for each in templates}
         self._tasks = tasks
         self._store = store
         self._refused = refused
+        self._mission = mission
+        self._cancelling: dict[str, asyncio.Task[None]] = {}
         self._last: OrderedDict[str, Asked] = OrderedDict()
         self._at_work: dict[str, _Work] = {}
         self._followed: OrderedDict[str, tuple[Callable[[Message], None], str]] = OrderedDict()
@@ -138,22 +155,26 @@ class RequestDesk:
 
     async def close(self) -> None:
         """Stop; what is being handed in is asked again by its sender."""
-        running = [each.running for each in self._at_work.values()]
+        running = [*(each.running for each in self._at_work.values()), *self._cancelling.values()]
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
 
-    def take(self, frame: Frame, *, robot: str, reply: Callable[[Message], None]) -> None:
+    def take(self, frame: Frame, *, robot: str, asker: str = "", reply: Callable[[Message], None]) -> None:
         """Take a command that is for this gateway.
 
         Args:
-            frame: COMMAND_LONG or COMMAND_INT.
-            robot: the vehicle that sent it or is addressed by it; empty for none.
+            frame: COMMAND_LONG, COMMAND_INT or COMMAND_CANCEL.
+            robot: the vehicle that sent it or is addressed by it, which it is about; empty for none.
+            asker: the vehicle that sent it, whose the task is; empty for a ground station or another computer.
             reply: sends a message back to the sender, as the component it addressed.
         """
         message = frame.message
         sender = f"{frame.system}-{frame.component}"
-        if message.command not in (ASK, CANCEL):
+        if frame.name == "COMMAND_CANCEL":
+            self._take_cancel(sender, frame, reply, asker or f"{STATION}{sender}")
+            return
+        if message.command not in (ASK, CANCEL, MISSION) or (message.command == MISSION and self._mission is None):
             self._count("command_unsupported")
             self._answer(frame, reply, dialect.UNSUPPORTED)
             return
@@ -165,8 +186,9 @@ class RequestDesk:
             self._answer(frame, reply, dialect.IN_PROGRESS if same else dialect.TEMPORARILY_REJECTED)
             return
         last = self._last.get(sender)
-        repeated = message.command == ASK and bool(getattr(message, "confirmation", 0))
-        again = last if repeated and last is not None and last.parameters == parameters else None
+        repeated = message.command != CANCEL and bool(getattr(message, "confirmation", 0))
+        same = last is not None and (last.command, last.parameters) == (message.command, parameters)
+        again = last if repeated and same else None
         if again is not None and again.result is not None:
             self._reply(frame, reply, again)
             return
@@ -176,32 +198,37 @@ class RequestDesk:
             self._answer(frame, reply, dialect.TEMPORARILY_REJECTED)
             return
         if again is not None:
-            work = self._hand_in(sender, frame, reply, again, robot)  # a gateway before this one did not come to answer
-        elif message.command == ASK:
-            work = self._begin(sender, frame, reply, robot)
+            # A gateway before this one did not come to answer.
+            work = self._hand_in(sender, frame, reply, again, robot, asker)
+        elif message.command != CANCEL:
+            work = self._begin(sender, frame, reply, robot, asker)
         else:
-            work = self._cancel(frame, reply, last)
+            work = self._cancel(frame, reply, last, asker or f"{STATION}{sender}")
         running = asyncio.create_task(work, name=f"MAVLink request of {sender}")
         self._at_work[sender] = _Work(command=message.command, parameters=parameters, running=running)
         running.add_done_callback(lambda _: self._at_work.pop(sender, None))
 
     # --- asking ------------------------------------------------------------------------------------------------
 
-    async def _begin(self, sender: str, frame: Frame, reply: Callable[[Message], None], robot: str) -> None:
-        asked = Asked(parameters=parameters_of(frame.message), task=f"m-{secrets.token_hex(6)}")
+    async def _begin(self, sender: str, frame: Frame, reply: Callable[[Message], None], robot: str, asker: str) -> None:
+        asked = Asked(
+            parameters=parameters_of(frame.message),
+            task=f"m-{secrets.token_hex(6)}",
+            command=frame.message.command,
+        )
         self._last[sender] = asked
         self._last.move_to_end(sender)
         while len(self._last) > MAX_SENDERS:
             silent, _ = self._last.popitem(last=False)
             await self._store.delete(PREFIX + silent)
-        await self._hand_in(sender, frame, reply, asked, robot)
+        await self._hand_in(sender, frame, reply, asked, robot, asker)
 
     async def _hand_in(
-        self, sender: str, frame: Frame, reply: Callable[[Message], None], asked: Asked, robot: str
+        self, sender: str, frame: Frame, reply: Callable[[Message], None], asked: Asked, robot: str, asker: str
     ) -> None:
         self._answer(frame, reply, dialect.IN_PROGRESS)
         try:
-            request = self._request(asked, robot=robot, sender=sender)
+            request = self._request(asked, robot=robot, submitter=asker or f"{STATION}{sender}")
             # Kept before it is handed in: whoever repeats it after a crash here asks for the same task.
             await self._store.put(PREFIX + sender, encode(asked))
             self._follow(asked.task, reply)
@@ -227,23 +254,26 @@ class RequestDesk:
             log.warning("the answer to a request could not be kept", sender=sender, reason=str(error))
         self._reply(frame, reply, asked)
 
-    def _request(self, asked: Asked, *, robot: str, sender: str) -> TaskRequest:
+    def _request(self, asked: Asked, *, robot: str, submitter: str) -> TaskRequest:
+        if asked.command == MISSION and self._mission is not None:
+            text, plan = self._mission(robot, asked.parameters)
+            return TaskRequest(instruction=text, id=asked.task, submitter=submitter, plan=plan)
         number = asked.parameters[0]
         template = self._templates.get(int(number)) if math.isfinite(number) else None
         if template is None:
             known = ", ".join(str(each) for each in sorted(self._templates)) or "none"
             raise PayloadError(f"no template {number:g}; known: {known}", remedy="add it to robots.templates")
         text = instruction(template, asked.parameters, robot=robot)
-        return TaskRequest(instruction=text, id=asked.task, submitter=robot or f"mavlink-{sender}")
+        return TaskRequest(instruction=text, id=asked.task, submitter=submitter)
 
-    async def _cancel(self, frame: Frame, reply: Callable[[Message], None], last: Asked | None) -> None:
+    async def _cancel(self, frame: Frame, reply: Callable[[Message], None], last: Asked | None, by: str) -> None:
         if last is None or self._tasks is None:
             self._say(reply, "no task of yours is known here", _ERROR)
             self._answer(frame, reply, dialect.DENIED)
             return
         self._answer(frame, reply, dialect.IN_PROGRESS)
         try:
-            record = await self._tasks.cancel(last.task)
+            record = await self._tasks.cancel(last.task, by)
         except NotFoundError as error:
             self._say(reply, error.message, _ERROR)
             self._answer(frame, reply, dialect.DENIED)
@@ -255,6 +285,43 @@ class RequestDesk:
             if ended:
                 self._say(reply, f"{last.task} had {record.state} already", _NOTICE)
             self._answer(frame, reply, dialect.DENIED if ended else dialect.ACCEPTED, number=task_number(last.task))
+
+    def _take_cancel(self, sender: str, frame: Frame, reply: Callable[[Message], None], by: str) -> None:
+        """Take a COMMAND_CANCEL; its repetitions while it is carried out need no answer of their own."""
+        if frame.message.command not in (ASK, MISSION):
+            self._count("command_unsupported")
+            self._say(reply, f"command {frame.message.command} is not cancelled here", _NOTICE)
+            return
+        if sender in self._cancelling:
+            return
+        if len(self._cancelling) >= MAX_AT_WORK:
+            self._count("mavlink_request_rejected")
+            return  # it is sent again until it is answered
+        work = self._cancel_asked(sender, frame, reply, by)
+        self._cancelling[sender] = asyncio.create_task(work, name=f"MAVLink cancel of {sender}")
+        self._cancelling[sender].add_done_callback(lambda _: self._cancelling.pop(sender, None))
+
+    async def _cancel_asked(self, sender: str, frame: Frame, reply: Callable[[Message], None], by: str) -> None:
+        """Stop the sender's last task by that command, once it is known whether there is one."""
+        at_work = self._at_work.get(sender)
+        if at_work is not None:
+            await asyncio.wait([at_work.running])
+        last = self._last.get(sender)
+        if last is None or last.command != frame.message.command or last.result != dialect.ACCEPTED or not self._tasks:
+            self._say(reply, "no task of yours is known here", _ERROR)
+            self._answer(frame, reply, dialect.DENIED)
+            return
+        try:
+            record = await self._tasks.cancel(last.task, by)
+        except SwiftbotError as error:
+            self._say(reply, error.message, _ERROR)
+            if isinstance(error, NotFoundError):
+                self._answer(frame, reply, dialect.DENIED)
+            return  # it is sent again until it is answered
+        ended = record.state.final and record.state is not TaskState.CANCELLED
+        if ended:
+            self._say(reply, f"{last.task} had {record.state} already", _NOTICE)
+        self._answer(frame, reply, dialect.ACCEPTED if ended else CANCELLED, number=task_number(last.task))
 
     # --- telling -----------------------------------------------------------------------------------------------
 
@@ -303,15 +370,9 @@ class RequestDesk:
         reply(dialect.make("COMMAND_ACK", **fields))
 
     def _say(self, reply: Callable[[Message], None], text: str, severity: int) -> None:
-        """Send a STATUSTEXT, in at most four parts; ASCII, since displays on radios know no other."""
-        data = text.encode("ascii", "replace")[: 4 * _TEXT]
-        number = 0 if len(data) <= _TEXT else 1 + secrets.randbelow(65_535)
-        for part in range(0, max(1, len(data)), _TEXT):
-            reply(
-                dialect.make(
-                    "STATUSTEXT", severity=severity, text=data[part : part + _TEXT], id=number, chunk_seq=part // _TEXT
-                )
-            )
+        """Send a STATUSTEXT."""
+        for each in texts.statustext(text, severity):
+            reply(each)
 
     def _count(self, what: str) -> None:
         self._refused[what] = self._refused.get(what, 0) + 1

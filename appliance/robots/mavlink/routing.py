@@ -4,17 +4,23 @@ Source: MAVLink guide, "Routing": a frame for everybody goes to all other ends; 
 system (or its component) has been heard, and nowhere when it was heard nowhere; nothing goes back to where it came
 from. Ends are (link, address): two vehicles on one listening port are two ends. A ring of routers would send a frame
 round for ever, so a frame that was seen just before is dropped, and a sender is believed on the end it was heard on
-last.
+last. What was learned ages, ends and senders alike.
 """
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from typing import Protocol
 
 from msgspec import Struct
 
-from appliance.robots.mavlink.links.base import Address
+from appliance.robots.mavlink.address import Address
 
 BROADCAST = 0
+WRAP = 128
+"""So many frames of one sender later the same bytes are news: sequence numbers begin again after 256."""
+MAX_SEEN = 8192
+MAX_PLANNED = 4096
+"""Destinations remembered by sender and target, so that they are worked out once for each way."""
 
 
 class End(Struct, frozen=True):
@@ -41,8 +47,37 @@ class Rules(Struct, frozen=True, kw_only=True):
         return name not in self.not_out and (not self.only_out or name in self.only_out)
 
 
+class Routed(Protocol):
+    """What routing looks at of a frame."""
+
+    @property
+    def system(self) -> int:
+        """Whose it is."""
+        ...
+
+    @property
+    def component(self) -> int:
+        """Of which component."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Which message."""
+        ...
+
+    @property
+    def target_system(self) -> int:
+        """Whom it is for; 0 for everybody."""
+        ...
+
+    @property
+    def target_component(self) -> int:
+        """And for which component."""
+        ...
+
+
 class Passage(Struct, frozen=True, kw_only=True):
-    """What routing looks at of a frame. Targets are 0 where a message has none, or means all."""
+    """A frame as routing sees it. Targets are 0 where a message has none, or means all."""
 
     system: int
     component: int
@@ -56,69 +91,131 @@ class Router:
     """Routes of one gateway, learned from what is heard.
 
     Args:
-        rules: of each link, in their order.
+        rules: of the links with the numbers 0, 1, ...; `add` and `remove` change them later.
         own_system: the gateway's system id: what is meant for it goes nowhere else.
-        forget_s: an end that was silent for so long is forgotten, with all that was learned of it.
+        forget_s: an end, or a sender at one, that was silent for so long is forgotten, with all that was learned of it.
         repeat_s: the same bytes within so long are a repetition, however they came.
         max_ends: most ends known at once; the longest silent is forgotten first.
+        max_routes: the same of senders: what invents system ids by the thousand costs no memory.
     """
 
     def __init__(
         self,
-        rules: Sequence[Rules],
+        rules: Sequence[Rules] = (),
         *,
         own_system: int,
         forget_s: float = 60.0,
         repeat_s: float = 0.5,
         max_ends: int = 256,
+        max_routes: int = 2048,
     ) -> None:
-        self._rules = tuple(rules)
+        self._rules = dict(enumerate(rules))
         self._own = own_system
         self._forget_s = forget_s
         self._repeat_s = repeat_s
         self._max_ends = max_ends
+        self._max_routes = max_routes
         self._ends: OrderedDict[End, float] = OrderedDict()
         """When each was heard last, the longest silent first."""
-        self._routes: dict[tuple[int, int], End] = {}
-        """Where each (system, component) was heard last."""
-        self._seen: OrderedDict[bytes, float] = OrderedDict()
+        self._routes: OrderedDict[tuple[int, int], tuple[End, float]] = OrderedDict()
+        """Where each (system, component) was heard last and when, the longest silent first."""
+        self._seen: OrderedDict[bytes, tuple[float, int]] = OrderedDict()
+        """When bytes were let through, and which frame of their sender they were."""
+        self._turns: dict[tuple[int, int], int] = {}
+        """Frames let through of each sender; there are 65,280."""
+        self._planned: dict[tuple[End, str, int, int], tuple[End, ...]] = {}
+
+    def add(self, link: int, rules: Rules) -> None:
+        """Know a link by its number."""
+        self._rules[link] = rules
+        self._planned.clear()
+
+    def remove(self, link: int) -> None:
+        """Forget a link and all its ends."""
+        self._rules.pop(link, None)
+        for end in [end for end in self._ends if end.link == link]:
+            self._forget(end)
 
     @property
     def ends(self) -> tuple[End, ...]:
         """Ends heard lately."""
         return tuple(self._ends)
 
+    @property
+    def routes(self) -> dict[tuple[int, int], End]:
+        """Where each (system, component) is."""
+        return {sender: end for sender, (end, _) in self._routes.items()}
+
     def knows(self, system: int, component: int) -> bool:
         """Whether that very component has been heard."""
         return (system, component) in self._routes
 
-    def repeated(self, raw: bytes, now: float) -> bool:
-        """Whether these bytes came just before; notes that they came now. Bounded by the time, and by 8192 frames."""
+    def repeated(self, raw: bytes, now: float, *, sender: tuple[int, int] | None = None) -> bool:
+        """Whether these bytes came just before; notes that they came now. Bounded by the time, and by 8192 frames.
+
+        Args:
+            raw: the frame.
+            now: monotonic seconds.
+            sender: whose it is; one that is so fast that its sequence numbers begin again within the time may say the
+                same again. None: no such allowance.
+        """
         while self._seen:
-            oldest = next(iter(self._seen.items()))
-            if now - oldest[1] <= self._repeat_s and len(self._seen) <= 8192:
+            oldest, (at, _) = next(iter(self._seen.items()))
+            if now - at <= self._repeat_s and len(self._seen) <= MAX_SEEN:
                 break
-            del self._seen[oldest[0]]
-        if raw in self._seen:
-            return True
-        self._seen[raw] = now
+            del self._seen[oldest]
+        turn = self._turns.get(sender, 0) if sender is not None else 0
+        before = self._seen.get(raw)
+        if before is not None:
+            if turn - before[1] < WRAP:
+                return True
+            self._seen.move_to_end(raw)
+        self._seen[raw] = (now, turn)
+        if sender is not None:
+            self._turns[sender] = turn + 1
         return False
 
-    def hear(self, passage: Passage, source: End, now: float) -> None:
+    def hear(self, passage: Routed, source: End, now: float) -> None:
         """Learn that a sender is at an end."""
+        sender = (passage.system, passage.component)
+        known = self._routes.get(sender)
+        if known is None or known[0] != source or source not in self._ends:
+            self._planned.clear()
         self._ends[source] = now
         self._ends.move_to_end(source)
-        self._routes[passage.system, passage.component] = source
+        self._routes[sender] = (source, now)
+        self._routes.move_to_end(sender)
         while self._ends:
             silent, at = next(iter(self._ends.items()))
             if now - at <= self._forget_s and len(self._ends) <= self._max_ends:
                 break
-            del self._ends[silent]
-            self._routes = {sender: end for sender, end in self._routes.items() if end != silent}
+            self._forget(silent)
+        while self._routes:
+            oldest, (_, at) = next(iter(self._routes.items()))
+            if now - at <= self._forget_s and len(self._routes) <= self._max_routes:
+                break
+            del self._routes[oldest]
+            self._planned.clear()
 
-    def destinations(self, passage: Passage, source: End) -> tuple[End, ...]:
+    def _forget(self, end: End) -> None:
+        del self._ends[end]
+        for sender in [sender for sender, (where, _) in self._routes.items() if where == end]:
+            del self._routes[sender]
+        self._planned.clear()
+
+    def destinations(self, passage: Routed, source: End) -> tuple[End, ...]:
         """Return the ends a frame heard at `source` goes on to."""
-        if not self._rules[source.link].lets_in(passage.name) or passage.target_system == self._own:
+        way = (source, passage.name, passage.target_system, passage.target_component)
+        planned = self._planned.get(way)
+        if planned is None:
+            if len(self._planned) >= MAX_PLANNED:
+                self._planned.clear()
+            planned = self._planned[way] = self._destinations(passage, source)
+        return planned
+
+    def _destinations(self, passage: Routed, source: End) -> tuple[End, ...]:
+        rules = self._rules.get(source.link)
+        if rules is None or not rules.lets_in(passage.name) or passage.target_system == self._own:
             return ()
         if passage.target_system == BROADCAST:
             found = set(self._ends)
@@ -135,5 +232,5 @@ class Router:
         """Ends of a component; of its whole system where the component is not meant, or was never heard."""
         exact = self._routes.get((system, component)) if component != BROADCAST else None
         if exact is not None:
-            return {exact}
-        return {end for (heard, _), end in self._routes.items() if heard == system}
+            return {exact[0]}
+        return {end for (heard, _), (end, _) in self._routes.items() if heard == system}

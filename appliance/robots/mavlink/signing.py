@@ -13,6 +13,7 @@ import struct
 import time
 from pathlib import Path
 
+import msgspec
 from msgspec import Struct
 
 from appliance.errors import ConfigError
@@ -27,6 +28,11 @@ WINDOW = 60 * TICKS_PER_S
 """A new stream may be this far behind the link's own time (guide: one minute)."""
 MAX_STREAMS = 1024
 """Streams remembered of one link; only holders of the key can make new ones."""
+AHEAD = 15 * TICKS_PER_S
+"""What is kept of a running link's own timestamps is so far ahead of them: three times as far as they get until it is
+kept again. So after a crash none is used twice, whatever this machine's clock then shows."""
+SINCE = 6 * TICKS_PER_S
+"""What streams may have gone on since they were kept: nothing so old is believed after a crash."""
 KEY_FILE_BYTES = 4096
 _HEX_KEY = 64
 
@@ -34,11 +40,15 @@ _HEX_KEY = 64
 class Memory(Struct, frozen=True, kw_only=True):
     """What a link must not forget over a restart.
 
-    Its time, and the newest timestamp of each stream as [link id, system, component, timestamp].
+    Its time, the newest timestamp that it used itself, and the newest of each stream as [link id, system, component,
+    timestamp]. What is kept while the link runs is not `exact`: `used` is ahead of what was, and the streams may have
+    gone on since.
     """
 
     timestamp: int = 0
+    used: int = 0
     streams: tuple[tuple[int, int, int, int], ...] = ()
+    exact: bool = True
 
 
 def ticks(unix_s: float) -> int:
@@ -54,18 +64,26 @@ class Signer:
         self._key = key
         self.link_id = link_id
         self._timestamp = memory.timestamp
-        self._streams = {(link, system, component): at for link, system, component, at in memory.streams}
+        self._used = max(memory.used, memory.timestamp)
+        since = 0 if memory.exact else SINCE
+        self._streams = {(link, system, component): at + since for link, system, component, at in memory.streams}
 
     @property
     def memory(self) -> Memory:
         """What to keep over a restart."""
         streams = tuple((*stream, at) for stream, at in self._streams.items())
-        return Memory(timestamp=self._timestamp, streams=streams)
+        return Memory(timestamp=self._timestamp, used=self._used, streams=streams)
+
+    @property
+    def ahead(self) -> Memory:
+        """What to keep while the link runs: after a crash it is on the safe side."""
+        return msgspec.structs.replace(self.memory, used=max(self._used, self._timestamp) + AHEAD, exact=False)
 
     def stamp(self, now: int) -> int:
         """Return the timestamp of the next frame: this one's own time, never one used before (a clock may go back)."""
-        self._timestamp = max(self._timestamp + 1, now)
-        return self._timestamp
+        self._timestamp = max(self._timestamp, now)
+        self._used = max(self._used + 1, self._timestamp)
+        return self._used
 
     def signature(self, frame: bytes, timestamp: int) -> bytes:
         """Return the 13 bytes that sign a frame whose header says that it is signed."""

@@ -8,48 +8,45 @@ Ground stations on any link are its guests: frames pass between them and the veh
 
 import asyncio
 import contextlib
-import time
 from collections import Counter
 from collections.abc import Callable
 
 import structlog
 
 from appliance.errors import SwiftbotError
-from appliance.model import Failure, Site, TaskRecord, encode
+from appliance.model import Failure, RobotCommand, Site, encode
 from appliance.plane.session import Closer, Session
+from appliance.robots.api import LinkList
 from appliance.robots.commands import CommandDesk
 from appliance.robots.doors import Tasks
 from appliance.robots.ledger import KeyValues, Ledger
 from appliance.robots.mavlink import dialect
-from appliance.robots.mavlink.copter import Copter
-from appliance.robots.mavlink.dialect import Codec, Frame, Message
-from appliance.robots.mavlink.keeping import REMEMBER_S, load_signer, remember
-from appliance.robots.mavlink.letters import LetterDesk
-from appliance.robots.mavlink.links import Address, Link, open_link
-from appliance.robots.mavlink.requests import RequestDesk
-from appliance.robots.mavlink.routing import BROADCAST, End, Passage, Router, Rules
-from appliance.robots.mavlink.tunnel import PAYLOAD_TYPE
+from appliance.robots.mavlink.control import OVERRIDES, moved
+from appliance.robots.mavlink.dialect import Frame, Message
+from appliance.robots.mavlink.greeting import ask_streams, heartbeat
+from appliance.robots.mavlink.helm import Helm
+from appliance.robots.mavlink.keeping import REMEMBER_S
+from appliance.robots.mavlink.routing import End
+from appliance.robots.mavlink.switch import Switch
+from appliance.robots.mavlink.table import LinkTable, OpenLink
 from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 
 log = structlog.get_logger(__name__)
 
-FRAME_ENCODING = "application/mavlink"
 _TICK_S = 0.05
 _OFFLINE_INFO_S = 5.0
 """How often the roster is reminded of a vehicle that is offline."""
-_STREAMS_HZ = {"GLOBAL_POSITION_INT": 5.0, "SYS_STATUS": 1.0, "MISSION_CURRENT": 2.0, "HOME_POSITION": 0.2}
-"""What is asked of a vehicle that has come online; ArduPilot sends little of it by itself."""
 
 
 class _Attached:
     """A vehicle and all that serves it."""
 
-    def __init__(self, vehicle: Vehicle, copter: Copter, desk: CommandDesk, address: Address) -> None:
+    def __init__(self, vehicle: Vehicle, helm: Helm, desk: CommandDesk, end: End) -> None:
         self.vehicle = vehicle
-        self.copter = copter
+        self.helm = helm
         self.desk = desk
-        self.address = address
+        self.end = end
         self.told_at = 0.0
         self.tell = True
         self.token: Closer | None = None
@@ -57,7 +54,7 @@ class _Attached:
 
 
 class Station:
-    """All MAVLink links of one gateway. `attached` names the vehicles heard so far."""
+    """All MAVLink vehicles of one gateway. `attached` names those heard so far; made on the event loop."""
 
     def __init__(
         self,
@@ -69,33 +66,36 @@ class Station:
         site: Site,
         refused: dict[str, int],
         tasks: Tasks | None = None,
+        gate: Callable[[str, RobotCommand], str] = lambda _, __: "",
     ) -> None:
         self._config = config
+        self._gate = gate
         self._session = session
         self._store = store
         self._gateway = gateway
         self._site = site
         self.refused = refused
-        self._links: list[Link] = []
         self._vehicles: dict[str, _Attached] = {}
         self._early: Counter[tuple[int, int]] = Counter()
         """Frames by system before its heartbeat; there are 255 systems a link."""
         self._by_source: dict[tuple[int, int], _Attached] = {}
         self._guests: set[tuple[int, int]] = set()
         """Link and system of ground stations and the like."""
-        rules = [
-            Rules(
-                only_in=frozenset(link.only_in),
-                not_in=frozenset(link.not_in),
-                only_out=frozenset(link.only_out),
-                not_out=frozenset(link.not_out),
-            )
-            for link in config.mavlink
-        ]
-        self._router = Router(rules, own_system=config.system_id)
-        self._requests = RequestDesk(config.templates, tasks=tasks, store=store, refused=refused)
-        self._letters = LetterDesk(tasks=tasks, refused=refused, clock=time.monotonic)
-        self._records: Closer | None = None
+        self._names: dict[End, tuple[str, ...]] = {}
+        """Vehicles at ends, worked out when first asked for."""
+        self._switch = Switch(
+            config,
+            session=session,
+            store=store,
+            gateway=gateway,
+            site=site,
+            refused=refused,
+            tasks=tasks,
+            on_frame=self._receive,
+            on_gone=self._link_gone,
+            vehicles_of=self._vehicles_of,
+            names_at=self._names_at,
+        )
         self._others: set[str] = set()
         self._watch: Closer | None = None
         self._ticking: asyncio.Task[None] | None = None
@@ -106,21 +106,22 @@ class Station:
         """Names of the MAVLink vehicles heard since start, online or not."""
         return tuple(sorted(self._vehicles))
 
+    @property
+    def links(self) -> LinkTable:
+        """The links, which may come and go at run time."""
+        return self._switch.links
+
+    def link_list(self) -> LinkList:
+        """All links, what went over them, and where each sender is."""
+        return self._switch.link_list()
+
     async def start(self) -> None:
         """Bind the ports and begin; ConfigError with the remedy when a port is taken."""
         try:
-            for index, link in enumerate(self._config.mavlink):
-                signer = await load_signer(link, index, self._store)
-                codec = Codec(self._config.system_id, self._config.component_id, signer=signer)
-                self._links.append(await open_link(link.remote, codec, self._receiver(index, link), self.refused))
-                log.info("MAVLink link open", link=str(link.remote), listens=link.remote.listens)
+            await self._switch.open()
         except SwiftbotError:
             await self.stop()
             raise
-        await self._requests.load()
-        self._records = self._session.subscribe_typed(
-            self._session.keys.task(), TaskRecord, self._on_record, wanted=self._follows
-        )
         self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
         self._ticking = asyncio.create_task(self._tick(), name="robot hub")
 
@@ -132,11 +133,7 @@ class Station:
                 with contextlib.suppress(asyncio.CancelledError):
                     await task
         self._ticking = None
-        await self._requests.close()
-        await self._letters.close()
-        if self._records is not None:
-            self._records.close()
-            self._records = None
+        await self._switch.quiet()
         for each in self._vehicles.values():
             await each.desk.close()
             for closer in (each.queryable, each.token):
@@ -147,126 +144,80 @@ class Station:
                 self._tell(each, "its gateway is stopping")
         self._vehicles.clear()
         self._by_source.clear()
-        for link in self._links:
-            await link.close()
-        await remember(self._links, self._config.mavlink, self._store)
-        self._links.clear()
+        self._names.clear()
+        await self.links.close()
         if self._watch is not None:
             self._watch.close()
             self._watch = None
 
     # --- frames ------------------------------------------------------------------------------------------------
 
-    def _receiver(self, index: int, link: MavlinkLink) -> Callable[[Frame, Address], None]:
-        def receive(frame: Frame, address: Address) -> None:
-            self._receive(index, link, frame, address)
-
-        return receive
-
-    def _receive(self, index: int, link: MavlinkLink, frame: Frame, address: Address) -> None:
-        now = asyncio.get_running_loop().time()
-        if self._router.repeated(frame.raw, now):
-            self._count("repeated")
-            return
-        each = self._by_source.get((index, frame.system))
-        if each is None and self._is_guest(index, frame):
-            if not self._ask(frame, End(index, address), None):
-                self._route(frame, End(index, address), now)
+    def _receive(self, entry: OpenLink, frame: Frame, source: End, now: float) -> None:
+        each = self._by_source.get((entry.number, frame.system))
+        if frame.name in OVERRIDES and self._config.route:
+            self._watch_sticks(frame, now)
+        if each is None and self._is_guest(entry, frame):
+            self._switch.record(source, "", "rx", frame.raw)
+            self._switch.hand_on(entry, frame, source, None, now)
             return
         if each is None:
-            each = self._welcome(index, link, frame, address)
+            each = self._welcome(entry, frame, source)
             if each is None:
+                self._switch.record(source, "", "rx", frame.raw)
                 return
-        if address != each.address:
+        if source != each.end:
             if each.vehicle.online:
                 self._count("address_conflict")
+                self._switch.record(source, "", "rx", frame.raw)
                 return
-            each.address = address  # restarted, or back over another way
+            each.end = source  # restarted, or back over another way
+            self._names.clear()
         vehicle = each.vehicle
         if vehicle.hear(frame, now):
             each.tell = True
-        self._session.put(self._session.keys.mavlink(vehicle.name, "rx"), frame.raw, encoding=FRAME_ENCODING)
+        self._switch.record(source, vehicle.name, "rx", frame.raw)
         self._see(each, now)
-        if not self._ask(frame, End(index, address), each):
-            self._route(frame, End(index, address), now)
+        self._switch.hand_on(entry, frame, source, vehicle, now)
 
-    def _ask(self, frame: Frame, source: End, sender: _Attached | None) -> bool:
-        """Take a command or message for the gateway as an onboard computer: of its own system, or of a vehicle's.
+    def _vehicles_of(self, system: int) -> list[Vehicle]:
+        return [each.vehicle for each in self._vehicles.values() if each.vehicle.system == system]
 
-        Ground stations know vehicles, not gateways: their buttons address component 191 of the vehicle's system. Where
-        a real companion computer has that number, the command is its.
-        """
-        tunnel = frame.name == "TUNNEL" and frame.message.payload_type == PAYLOAD_TYPE
-        if not tunnel and frame.name not in ("COMMAND_LONG", "COMMAND_INT"):
-            return False
-        system, component = frame.message.target_system, frame.message.target_component
-        if component != self._config.component_id:
-            return False
-        robot = "" if sender is None else sender.vehicle.name
-        if system != self._config.system_id:
-            addressed = [each for each in self._vehicles.values() if each.vehicle.system == system]
-            if len(addressed) != 1 or self._router.knows(system, component):
-                return False
-            robot = addressed[0].vehicle.name
+    def _names_at(self, end: End) -> tuple[str, ...]:
+        found = self._names.get(end)
+        if found is None:
+            if len(self._names) > 4096:
+                self._names.clear()
+            found = tuple(each.vehicle.name for each in self._by_source.values() if each.end == end)
+            self._names[end] = found
+        return found
 
-        def reply(message: Message) -> None:
-            if source.link < len(self._links):
-                raw = self._links[source.link].send(message, source.address, system=system)
-                if sender is not None:
-                    name = sender.vehicle.name
-                    self._session.put(self._session.keys.mavlink(name, "tx"), raw, encoding=FRAME_ENCODING)
-
-        (self._letters if tunnel else self._requests).take(frame, robot=robot, reply=reply)
-        return True
-
-    def _follows(self, key: str) -> bool:
-        """Whether anybody here is told of a record: most are of other gateways' business, and large."""
-        task = key.split("/")[-2]
-        return self._requests.follows(task) or self._letters.follows(task)
-
-    def _on_record(self, key: str, record: TaskRecord | None) -> None:
-        del key
-        if record is not None:
-            self._requests.news(record)
-            self._letters.news(record)
-
-    def _is_guest(self, index: int, frame: Frame) -> bool:
+    def _is_guest(self, entry: OpenLink, frame: Frame) -> bool:
         """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer."""
         if not self._config.route or frame.system == self._config.system_id:
             return False
-        if frame.name == "HEARTBEAT" and frame.message.autopilot == dialect.AUTOPILOT_NONE:
-            if (index, frame.system) not in self._guests:
-                self._guests.add((index, frame.system))
-                log.info("MAVLink guest", link=str(self._links[index].remote), system=frame.system)
-            return True
-        if is_autopilot(frame):
-            self._guests.discard((index, frame.system))  # a vehicle whose camera or radio was heard first
-        return (index, frame.system) in self._guests
+        if frame.name == "HEARTBEAT":
+            if frame.message.autopilot == dialect.AUTOPILOT_NONE:
+                if (entry.number, frame.system) not in self._guests:
+                    self._guests.add((entry.number, frame.system))
+                    log.info("MAVLink guest", link=str(entry.setting.remote), system=frame.system)
+                return True
+            if is_autopilot(frame):  # a vehicle whose camera or radio was heard first
+                self._guests.discard((entry.number, frame.system))
+        return (entry.number, frame.system) in self._guests
 
-    def _route(self, frame: Frame, source: End, now: float) -> None:
-        """Pass a frame on to where it is meant for."""
-        if not self._config.route:
-            return
-        passage = Passage(
-            system=frame.system,
-            component=frame.component,
-            name=frame.name,
-            raw=frame.raw,
-            target_system=getattr(frame.message, "target_system", BROADCAST),
-            target_component=getattr(frame.message, "target_component", BROADCAST),
-        )
-        self._router.hear(passage, source, now)
-        for end in self._router.destinations(passage, source):
-            raw = self._links[end.link].codec.pass_on(frame)
-            self._links[end.link].transmit(raw, end.address)
-            for (index, _), each in self._by_source.items():
-                if index == end.link and each.address == end.address:
-                    self._session.put(self._session.keys.mavlink(each.vehicle.name, "tx"), raw, encoding=FRAME_ENCODING)
+    def _watch_sticks(self, frame: Frame, now: float) -> None:
+        """Notice a person who takes a vehicle over the gateway."""
+        if frame.name in OVERRIDES:
+            for each in self._vehicles.values():
+                target = frame.message.target if frame.name == "MANUAL_CONTROL" else frame.message.target_system
+                if each.vehicle.system == target:
+                    each.tell |= each.vehicle.control.sticks(frame.system, moved(frame.name, frame.message), now)
 
-    def _welcome(self, index: int, link: MavlinkLink, frame: Frame, address: Address) -> _Attached | None:
+    def _welcome(self, entry: OpenLink, frame: Frame, source: End) -> _Attached | None:
         """Make a robot of a new system if its frame is an autopilot's heartbeat and it may have a name."""
-        name = link.name_of(frame.system)
-        known = sum(source == index for source, _ in self._by_source)
+        index = entry.number
+        name = entry.setting.name_of(frame.system)
+        known = sum(heard == index for heard, _ in self._by_source)
         if frame.system == self._config.system_id or name is None or known >= self._config.max_vehicles:
             self._count("unknown_system")
             return None
@@ -281,45 +232,78 @@ class Station:
         # What it sent before its first heartbeat was not a stranger's.
         if early := self._early.pop((index, frame.system), 0):
             self.refused["unknown_system"] -= early
-        each = self._attach(index, name, address)
+        each = self._attach(name, source)
+        self._names.clear()
         self._by_source[index, frame.system] = each
         return each
 
-    def _attach(self, index: int, name: str, address: Address) -> _Attached:
+    def _attach(self, name: str, source: End) -> _Attached:
 
-        vehicle = Vehicle(name, site=self._site, send=lambda message: self._send(index, name, message))
-        copter = Copter(vehicle, site=self._site, config=self._config)
+        own = self._config.system_id
+        vehicle = Vehicle(name, site=self._site, send=lambda message: self._send(name, message), own=own)
+        vehicle.announce = lambda message: self._announce(name, message)
+        helm = Helm(vehicle, site=self._site, config=self._config)
         ledger = Ledger(name, self._store, limit=self._config.ledger)
         desk = CommandDesk(
             name,
             session=self._session,
             ledger=ledger,
-            verbs=copter.verbs(),
-            ready=copter.ready,
-            halt=copter.halt,
+            verbs=helm.verbs(),
+            ready=helm.ready,
+            halt=helm.halt,
             refused=self.refused,
+            gate=self._gate,
         )
-        each = _Attached(vehicle, copter, desk, address)
+        each = _Attached(vehicle, helm, desk, source)
         self._vehicles[name] = each
 
         async def serve() -> None:
             await ledger.load()
-            desk.verbs = copter.verbs()  # its heartbeat has told by now what it is: it can be commanded at once
+            desk.verbs = helm.verbs()  # its heartbeat has told by now what it is: it can be commanded at once
             each.queryable = self._session.serve(self._session.keys.command(name), desk.handle)
             self._see(each, asyncio.get_running_loop().time())
-            log.info("vehicle attached", robot=name, address=address)
+            log.info("vehicle attached", robot=name, address=source.address)
 
         task = asyncio.create_task(serve(), name=f"attach {name}")
         self._attaching.add(task)
         task.add_done_callback(self._attaching.discard)
         return each
 
-    def _send(self, index: int, name: str, message: Message) -> None:
+    def _send(self, name: str, message: Message) -> None:
         each = self._vehicles.get(name)
-        if each is None or index >= len(self._links):
+        if each is not None:
+            self._switch.send(each.end, name, message)
+
+    def _link_gone(self, entry: OpenLink) -> None:
+        """Let the vehicles of a link that was removed go: they may come back over another."""
+        self._guests = {(number, system) for number, system in self._guests if number != entry.number}
+        for number, system in [source for source in self._early if source[0] == entry.number]:
+            del self._early[number, system]
+        for (number, system), each in list(self._by_source.items()):
+            if number == entry.number:
+                del self._by_source[number, system]
+                self._vehicles.pop(each.vehicle.name, None)
+                task = asyncio.create_task(self._let_go(each), name=f"detach {each.vehicle.name}")
+                self._attaching.add(task)
+                task.add_done_callback(self._attaching.discard)
+        self._names.clear()
+
+    async def _let_go(self, each: _Attached) -> None:
+        await each.desk.close()
+        for closer in (each.queryable, each.token):
+            if closer is not None:
+                closer.close()
+        each.vehicle.online = False
+        self._tell(each, "its link was removed")
+        log.info("vehicle let go", robot=each.vehicle.name)
+
+    def _announce(self, name: str, message: Message) -> None:
+        """Send a message to a vehicle and to whoever else listens: ground stations, other routers."""
+        each = self._vehicles.get(name)
+        if each is None:
             return
-        raw = self._links[index].send(message, each.address)
-        self._session.put(self._session.keys.mavlink(name, "tx"), raw, encoding=FRAME_ENCODING)
+        each.vehicle.send(message)
+        self._switch.announce(message, {attached.end for attached in self._by_source.values()})
 
     # --- presence ----------------------------------------------------------------------------------------------
 
@@ -331,25 +315,8 @@ class Station:
         each.vehicle.online = True
         each.tell = True
         each.token = self._session.declare_alive(self._session.keys.robot_alive(each.vehicle.name))
-        self._ask_streams(each)
+        ask_streams(each.vehicle)
         log.info("vehicle online", robot=each.vehicle.name)
-
-    def _ask_streams(self, each: _Attached) -> None:
-
-        for stream, hz in _STREAMS_HZ.items():
-            fields = {f"param{number}": 0.0 for number in range(3, 8)}
-            each.vehicle.send(
-                dialect.make(
-                    "COMMAND_LONG",
-                    target_system=each.vehicle.system,
-                    target_component=each.vehicle.component,
-                    command=dialect.SET_INTERVAL,
-                    confirmation=0,
-                    param1=float(dialect.constant(f"MAVLINK_MSG_ID_{stream}")),
-                    param2=1e6 / hz,
-                    **fields,
-                )
-            )
 
     async def _lost(self, each: _Attached) -> None:
         each.vehicle.online = False
@@ -378,13 +345,13 @@ class Station:
     async def _tick(self) -> None:
         """Send heartbeats, notice lost ones, tell the roster."""
         loop = asyncio.get_running_loop()
-        beat_at, remember_at = 0.0, loop.time() + REMEMBER_S
+        beat_at, time_at, remember_at = 0.0, 0.0, loop.time() + REMEMBER_S
         while True:
             now = loop.time()
             if now >= remember_at:
                 remember_at = now + REMEMBER_S
                 with contextlib.suppress(SwiftbotError):  # a disk that is full now may not be so the next time
-                    await remember(self._links, self._config.mavlink, self._store)
+                    await self.links.remember()
             if now >= beat_at:
                 beat_at = now + self._config.heartbeat_s
                 self._beat()
@@ -394,38 +361,32 @@ class Station:
                 interval = 1.0 / self._config.state_hz if each.vehicle.online else _OFFLINE_INFO_S
                 if each.queryable is not None and (each.tell or now - each.told_at >= interval):
                     self._tell(each)
-            self._letters.tick()
+            if self._config.timesync_s and now >= time_at:
+                time_at = now + self._config.timesync_s
+                self._switch.ask_time({each.end for each in self._vehicles.values() if each.vehicle.online})
+            self._switch.tick(now)
             await asyncio.sleep(_TICK_S)
 
     def _beat(self) -> None:
         """Tell every vehicle, and every other end that may not have been heard yet, that the gateway is there."""
-        beat = dialect.make(
-            "HEARTBEAT",
-            type=dialect.TYPE_ONBOARD,
-            autopilot=dialect.AUTOPILOT_NONE,
-            base_mode=0,
-            custom_mode=0,
-            system_status=dialect.STATE_ACTIVE,
-            mavlink_version=3,
-        )
-        reached: set[tuple[int, Address]] = set()
-        for (index, _), each in self._by_source.items():
+        beat = heartbeat()
+        reached: set[End] = set()
+        for each in self._by_source.values():
             each.vehicle.send(beat)
-            reached.add((index, each.address))
-        for index, link in enumerate(self._links):
-            for other in link.others:
-                if (index, other) not in reached:
-                    link.send(beat, other)
+            reached.add(each.end)
+        self._switch.greet(beat, reached)
 
     def _tell(self, each: _Attached, note: str = "") -> None:
         """Put the roster entry; the verbs follow from what the last heartbeat said it is."""
         each.tell = False
         each.told_at = asyncio.get_running_loop().time()
-        each.desk.verbs = each.copter.verbs()
+        each.desk.verbs = each.helm.verbs()
         if not note and not each.vehicle.online:
             note = "no heartbeat"
         elif not note and not each.vehicle.commandable:
-            note = "watched, not commanded: only ArduPilot multirotors are so far"
+            note = "watched, not commanded: only ArduPilot multirotors, rovers and boats are so far"
+        elif not note and each.vehicle.control.seized is not None:
+            note = f"taken: {each.vehicle.control.seized.why}"
         elif not note:
             note = ", ".join(each.desk.busy)
         verbs = (*each.desk.verbs, "stop") if each.vehicle.commandable else tuple(each.desk.verbs)

@@ -10,16 +10,50 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 
 from appliance.model import Pose, RobotInfo, Site
-from appliance.robots.geo import to_site
+from appliance.model.geo import to_site
 from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink.condition import Condition
+from appliance.robots.mavlink.control import Control
 from appliance.robots.mavlink.dialect import Frame, Message
+from appliance.robots.mavlink.modes import Modes, modes_of
+from appliance.robots.mavlink.said import WARNING, Texts
 
 Address = tuple[str, int]
 
 _NO_HEADING = 65535
 _NO_BATTERY = -1
+_UNKNOWN_TOTAL = 65535
+MAX_COMPONENTS = 16
+"""Components of one vehicle that are remembered."""
+_OF_COMPONENTS = frozenset(
+    {
+        "COMMAND_ACK",
+        "CAMERA_INFORMATION",
+        "CAMERA_CAPTURE_STATUS",
+        "CAMERA_IMAGE_CAPTURED",
+        "GIMBAL_MANAGER_INFORMATION",
+        "GIMBAL_DEVICE_ATTITUDE_STATUS",
+    }
+)
+"""Messages that cameras and gimbals send themselves, which somebody here may wait for."""
 MAX_WAITING = 256
 """Messages kept for one waiter; older ones are dropped, as on a radio link."""
+_HEARD = frozenset(
+    (
+        "HEARTBEAT",
+        "GLOBAL_POSITION_INT",
+        "SYS_STATUS",
+        "BATTERY_STATUS",
+        "HOME_POSITION",
+        "MISSION_CURRENT",
+        "MISSION_ITEM_REACHED",
+        "STATUSTEXT",
+        "EKF_STATUS_REPORT",
+        "ESTIMATOR_STATUS",
+        "FENCE_STATUS",
+    )
+)
+"""Messages that tell the vehicle's state."""
 
 
 def is_autopilot(frame: Frame) -> bool:
@@ -37,10 +71,14 @@ def is_autopilot(frame: Frame) -> bool:
 class Vehicle:
     """One vehicle. `send` puts a message on its link; `now` of `hear` is monotonic seconds."""
 
-    def __init__(self, name: str, *, site: Site, send: Callable[[Message], None]) -> None:
+    def __init__(self, name: str, *, site: Site, send: Callable[[Message], None], own: int = 0) -> None:
         self.name = name
+        self.own = own
+        """System id that the gateway speaks as, so that answers to others are told from those to it; 0: not told."""
         self.site = site
         self.send = send
+        self.announce: Callable[[Message], None] = send
+        """Puts a message on all links, for whoever listens: ground stations show STATUSTEXTs."""
         self.system = 0
         self.component = 0
         self.kind = 0
@@ -63,23 +101,39 @@ class Vehicle:
         self.mission_at = 0
         self.mission_complete = False
         self.reached: set[int] = set()
+        self.mission_items = 0
+        """Items of the mission that is on board, its home included."""
         self.text = ""
         """Last warning that the vehicle gave."""
+        self.texts = Texts()
+        self.condition = Condition()
+        self.control = Control()
+        self.components: dict[int, int] = {}
+        """Component id -> MAV_TYPE of what else beats under its system id: cameras, gimbals, companion computers."""
         self.exchange = asyncio.Lock()
         """COMMAND_ACK answers by command id alone and there is one mission transfer: one exchange at a time."""
         self._waiting: list[tuple[frozenset[str], asyncio.Queue[Message]]] = []
 
     @property
     def commandable(self) -> bool:
-        """Whether its flight modes are known here: ArduPilot multirotors."""
-        return self.autopilot == dialect.AUTOPILOT_ARDUPILOT and self.kind in dialect.MULTIROTORS
+        """Whether its modes are known here: ArduPilot multirotors, rovers and boats."""
+        return self.modes is not None
+
+    @property
+    def modes(self) -> Modes | None:
+        """Its modes, None when they are not known here."""
+        return modes_of(self.autopilot, self.kind)
+
+    @property
+    def flies(self) -> bool:
+        """Whether it is a multirotor."""
+        return self.kind in dialect.MULTIROTORS
 
     @property
     def mode(self) -> str:
         """Flight mode by name; the number where the name is not known."""
-        if self.commandable:
-            return dialect.COPTER_MODE_NAMES.get(self.custom_mode, str(self.custom_mode))
-        return str(self.custom_mode)
+        modes = self.modes
+        return str(self.custom_mode) if modes is None else modes.name(self.custom_mode)
 
     @property
     def airborne(self) -> bool:
@@ -99,32 +153,57 @@ class Vehicle:
         x, y, z = to_site(self.site, self.latitude_deg, self.longitude_deg, self.altitude_m)
         return Pose(x=round(x, 3), y=round(y, 3), z=round(z, 3), heading_deg=round(self.heading_deg, 1))
 
+    @property
+    def home_pose(self) -> Pose | None:
+        """Home in site metres, None before it was told."""
+        if self.home is None:
+            return None
+        x, y, z = to_site(self.site, *self.home)
+        return Pose(x=round(x, 2), y=round(y, 2), z=round(z, 2))
+
     def info(self, gateway: str, verbs: tuple[str, ...], note: str = "") -> RobotInfo:
         """Describe it for the roster."""
         return RobotInfo(
             id=self.name,
             kind="mavlink",
             gateway=gateway,
-            uses=("base",) if self.commandable else (),
+            uses=("base", "speaker") if self.commandable else (),
             verbs=verbs,
-            flies=self.kind in dialect.MULTIROTORS,
+            flies=self.flies,
             pose=self.pose,
+            home=self.home_pose,
             battery_percent=self.battery_percent,
             armed=self.armed,
             mode=self.mode,
             online=self.online,
             note=note,
+            speed_mps=round(self.speed_mps, 1),
+            mission_item=self.mission_at,
+            mission_items=self.mission_items,
+            estimator=self.condition.estimator,
+            warnings=self.condition.warnings,
+            failsafe=self.condition.failsafe,
+            seized="" if self.control.seized is None else self.control.seized.why,
         )
 
+    def component_of(self, kind: int) -> int | None:
+        """Return the id of a component of that MAV_TYPE, None when none has been heard."""
+        return min((number for number, each in self.components.items() if each == kind), default=None)
+
     def hear(self, frame: Frame, now: float) -> bool:
-        """Take in a frame; return whether the roster should hear of it at once (mode, arming)."""
+        """Take in a frame; return whether the roster should hear of it at once (mode, arming, failsafes, control)."""
         if frame.component != self.component and frame.name != "HEARTBEAT":
+            if frame.name in _OF_COMPONENTS:
+                self._pass_on(frame)
             return False
+        if frame.name not in _HEARD:
+            self._pass_on(frame)
+            return False  # most are for others: they are not even decoded
         message = frame.message
-        changed = False
+        changed = frame.component == self.component and self.condition.hear(frame.name, message)
         match frame.name:
             case "HEARTBEAT":
-                changed = self._heartbeat(frame, now)
+                changed = self._heartbeat(frame, now) or changed
             case "GLOBAL_POSITION_INT":
                 self._position(message)
             case "SYS_STATUS" | "BATTERY_STATUS":
@@ -135,20 +214,27 @@ class Vehicle:
             case "MISSION_CURRENT":
                 self.mission_at = message.seq
                 self.mission_complete = message.mission_state == 5
+                if message.total != _UNKNOWN_TOTAL:
+                    self.mission_items = message.total
             case "MISSION_ITEM_REACHED":
                 self.reached.add(message.seq)
             case "STATUSTEXT":
-                if message.severity <= 4:
-                    raw = message.text
-                    self.text = raw.decode("utf-8", "replace") if isinstance(raw, bytes) else str(raw)
+                said = self.texts.take(message.severity, message.text, message.id, message.chunk_seq, now)
+                if said is not None and said.severity <= WARNING:
+                    self.text = said.text
             case _:
                 pass
+        self._pass_on(frame)
+        return changed
+
+    def _pass_on(self, frame: Frame) -> None:
+        """Hand a message to those who wait for it."""
         for names, queue in self._waiting:
             if frame.name in names:
+                message = frame.message
                 if queue.full():
                     queue.get_nowait()
                 queue.put_nowait(message)
-        return changed
 
     @asynccontextmanager
     async def listening(self, *names: str) -> AsyncGenerator[asyncio.Queue[Message]]:
@@ -172,13 +258,17 @@ class Vehicle:
         if self.component == 0 and is_autopilot(frame):
             self.system, self.component = frame.system, frame.component
         if frame.component != self.component:
+            if frame.component in self.components or len(self.components) < MAX_COMPONENTS:
+                self.components[frame.component] = message.type
             return False
         before = (self.custom_mode, self.armed, self.kind, self.autopilot)
         self.heard_at = now
         self.kind, self.autopilot = message.type, message.autopilot
         self.custom_mode = message.custom_mode
         self.armed = bool(message.base_mode & dialect.ARMED_FLAG)
-        return before != (self.custom_mode, self.armed, self.kind, self.autopilot)
+        changed = before != (self.custom_mode, self.armed, self.kind, self.autopilot)
+        failsafe = self.condition.failsafe
+        return self.control.hear(self.custom_mode, self.armed, failsafe, self.modes, now) or changed
 
     def _position(self, message: Message) -> None:
         self.latitude_deg, self.longitude_deg = message.lat / 1e7, message.lon / 1e7

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from appliance.model import Pose
-from appliance.robots.geo import bearing_deg, turn_deg
+from appliance.model.geo import bearing_deg, turn_deg
 
 ACCELERATION = 1.5
 TURN_DPS = 120.0
@@ -23,14 +23,16 @@ class Driving:
     """Where the rover is, how fast it goes, and the way it still has."""
 
     def __init__(self, x: float, y: float, *, battery_percent: float = 100.0) -> None:
-        self.x = x
-        self.y = y
+        self.x: float = x
+        self.y: float = y
         self.heading_deg = 0.0
         self.speed = 0.0
         self.battery_percent = battery_percent
         self.driven_m = 0.0
         self._way: list[tuple[float, float]] = []
         self._limit = USUAL_MPS
+        self._by_hand: tuple[float, float, float] | None = None
+        """Speeds east and north, and the turn in degrees a second, that a person asks for."""
 
     @property
     def pose(self) -> Pose:
@@ -44,17 +46,32 @@ class Driving:
 
     def go(self, way: Sequence[tuple[float, float]], speed: float | None) -> None:
         """Begin a way; m/s."""
+        self._by_hand = None
         self._way = list(way)
         self._limit = min(speed or USUAL_MPS, TOP_MPS)
 
     def halt(self) -> None:
         """Stop here; at these speeds within centimetres."""
+        self._by_hand = None
         self._way = []
         self.speed = 0.0
+
+    def by_hand(self, east_mps: float, north_mps: float, turn_dps: float) -> None:
+        """Move as a person asks, until it is told otherwise or halts; a base with wheels for every direction."""
+        self._way = []
+        self._by_hand = (east_mps, north_mps, turn_dps)
 
     def step(self, dt: float) -> None:
         """Move on by `dt` seconds."""
         self.battery_percent = max(0.0, self.battery_percent - DRAIN_PER_S * dt)
+        if self._by_hand is not None and self.battery_percent > 0.0:
+            east, north, turn = self._by_hand
+            self.x, self.y = self.x + east * dt, self.y + north * dt
+            self.heading_deg = (self.heading_deg + turn * dt) % 360.0
+            self.speed = math.hypot(east, north)
+            self.driven_m += self.speed * dt
+            self.battery_percent = max(0.0, self.battery_percent - DRAIN_PER_M * self.speed * dt)
+            return
         while dt > 1e-9 and self._way and self.battery_percent > 0.0:
             piece = min(dt, _STEP_S)
             self._step(piece)

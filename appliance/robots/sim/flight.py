@@ -1,13 +1,14 @@
 """How the simulated copter moves: a point with limited speed and acceleration, a battery, and flight modes.
 
 It is no model of aerodynamics. It exists so that missions take time, end where they should, and can go wrong in
-the ways that matter here: not armed, battery low, mode changed. Pure: `step(dt)`, metres, seconds.
+the ways that matter here: not armed, battery low, mode changed, more wind than it can fly against. Pure: `step(dt)`,
+metres, seconds.
 """
 
 import math
 from typing import NamedTuple
 
-from appliance.robots.geo import bearing_deg, turn_deg
+from appliance.model.geo import bearing_deg, turn_deg
 
 ACCELERATION = 2.5
 """m/s²; a brisk multirotor."""
@@ -20,6 +21,9 @@ _STEP_S = 0.05
 DRAIN_PER_S = 0.03
 """Percent of battery per second in the air: some 55 minutes."""
 IDLE_DRAIN_PER_S = 0.001
+TOP_AIR_MPS = 12.0
+"""Fastest through the air: against more wind than that it is blown away."""
+_GRAVITY = 9.81
 
 
 class Point(NamedTuple):
@@ -41,6 +45,10 @@ class Flight:
         self.speed = speed
         self.armed = False
         self.target: Point | None = None
+        self.hand: Point | None = None
+        """Velocity that a person's sticks ask for; it counts before `target`."""
+        self.wind = Point(0.0, 0.0, 0.0)
+        """Where the air goes to, m/s."""
 
     @property
     def landed(self) -> bool:
@@ -59,14 +67,14 @@ class Flight:
             dt -= piece
 
     def _step(self, dt: float) -> None:
-        drain = DRAIN_PER_S if self.armed and not self.landed else IDLE_DRAIN_PER_S
+        flying = self.armed and not self.landed
+        air = math.dist(self.velocity, self.wind) / TOP_AIR_MPS if flying else 0.0
+        drain = DRAIN_PER_S * (1.0 + air * air) if flying else IDLE_DRAIN_PER_S
         self.battery_percent = max(0.0, self.battery_percent - drain * dt)
         if not self.armed:
-            self.velocity = Point(0.0, 0.0, 0.0)
-            if self.landed:
-                self.position = self.position._replace(z=0.0)
+            self._fall(dt)
             return
-        wanted = self._wanted_velocity()
+        wanted = self._within_the_air(self._wanted_velocity())
         change = [new - old for new, old in zip(wanted, self.velocity, strict=True)]
         size = math.hypot(*change)
         share = 1.0 if size <= ACCELERATION * dt else ACCELERATION * dt / size
@@ -81,7 +89,29 @@ class Flight:
             turn = turn_deg(self.heading_deg, bearing_deg(self.velocity.x, self.velocity.y))
             self.heading_deg = (self.heading_deg + max(-TURN_DPS * dt, min(TURN_DPS * dt, turn))) % 360.0
 
+    def _fall(self, dt: float) -> None:
+        if self.landed:
+            self.velocity, self.position = Point(0.0, 0.0, 0.0), self.position._replace(z=0.0)
+            return
+        self.velocity = self.velocity._replace(z=self.velocity.z - _GRAVITY * dt)
+        x, y, z = (place + speed * dt for place, speed in zip(self.position, self.velocity, strict=True))
+        self.position = Point(x, y, max(0.0, z))
+
+    def _within_the_air(self, wanted: Point) -> Point:
+        """Hold a wanted velocity to what can be flown in this wind."""
+        if self.landed:
+            return wanted
+        through = math.hypot(wanted.x - self.wind.x, wanted.y - self.wind.y)
+        if through <= TOP_AIR_MPS:
+            return wanted
+        share = TOP_AIR_MPS / through
+        x = self.wind.x + (wanted.x - self.wind.x) * share
+        y = self.wind.y + (wanted.y - self.wind.y) * share
+        return Point(x, y, wanted.z)
+
     def _wanted_velocity(self) -> Point:
+        if self.hand is not None:
+            return self.hand
         if self.target is None:
             return Point(0.0, 0.0, 0.0)
         away = Point(*(there - here for there, here in zip(self.target, self.position, strict=True)))

@@ -1,12 +1,13 @@
-"""A simulated MAVLink copter as a process of its own: it sends to a gateway, as SITL's `--out` does, or waits for one.
+"""A simulated MAVLink vehicle as a process of its own: it sends to a gateway, as SITL's `--out` does, or waits for one.
 
-Its link can be made lossy, which is what radio links are: the same share of frames is dropped each way.
+Its link can be made bad in the ways radio links are (`air`), the same each way.
 """
 
 import asyncio
 import math
-import random
 import time
+from collections.abc import Sequence
+from typing import Literal
 
 import structlog
 from msgspec import Struct, field
@@ -18,8 +19,12 @@ from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Link, open_link
 from appliance.robots.mavlink.signing import Signer, read_key
 from appliance.robots.settings import MAX_SYSTEM, Remote, read_remote
-from appliance.robots.sim.copter import STREAMS_HZ, SimCopter
-from appliance.robots.sim.telemetry import telemetry
+from appliance.robots.sim.air import Air, Channel
+from appliance.robots.sim.autopilot import AnyAutopilot
+from appliance.robots.sim.components import Component, SimCamera, SimGimbal
+from appliance.robots.sim.copter import SimCopter
+from appliance.robots.sim.rover import SimRover
+from appliance.robots.sim.telemetry import STREAMS_HZ, telemetry
 
 log = structlog.get_logger(__name__)
 
@@ -30,8 +35,9 @@ _LATE_S = 1.0
 
 
 class VehicleSettings(Struct, frozen=True, kw_only=True):
-    """One simulated copter."""
+    """One simulated vehicle."""
 
+    kind: Literal["copter", "rover"] = "copter"
     to: str = "udp://127.0.0.1:14550"
     """Where the gateway listens, udp:// or tcp://."""
     listen: bool = False
@@ -47,7 +53,22 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     battery_percent: float = 100.0
     drop: float = 0.0
     """Share of frames lost, each way."""
+    double: float = 0.0
+    """Share of frames that arrive twice, each way."""
+    mix: float = 0.0
+    """Share of frames that arrive after later ones, each way."""
+    delay_s: float = 0.0
+    """Time that frames are on their way, each way."""
     seed: int = 1
+    parameters: dict[str, float] = field(default_factory=dict[str, float])
+    """Parameters that differ from the defaults when it is switched on: `SIM_WIND_SPD`, `FENCE_ENABLE`, ..."""
+    camera: bool = True
+    """A camera and a gimbal are on board."""
+
+    @property
+    def air(self) -> Air:
+        """Its link."""
+        return Air(drop=self.drop, double=self.double, mix=self.mix, delay_s=self.delay_s, seed=self.seed)
 
     @property
     def remote(self) -> Remote:
@@ -62,8 +83,7 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
             raise ConfigError(f"MAVLink system id {self.system}", remedy="use 1 to 255")
         if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
             raise ConfigError(f"rate {self.rate:g}", remedy="use more than 0, at most 100")
-        if not 0.0 <= self.drop < 1.0:
-            raise ConfigError(f"drop {self.drop:g}", remedy="use a share from 0 to below 1")
+        self.air.check()
 
 
 def start_point(site: Site, start: str) -> tuple[float, float]:
@@ -77,47 +97,75 @@ def start_point(site: Site, start: str) -> tuple[float, float]:
     return place.x, place.y
 
 
+def read_parameters(given: Sequence[str]) -> dict[str, float]:
+    """Return parameters by name of `NAME=VALUE` texts; ConfigError for anything else."""
+    found: dict[str, float] = {}
+    for each in given:
+        name, equals, value = each.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not equals or not name or not math.isfinite(number):
+            raise ConfigError(f"{each!r} is no parameter", remedy="write NAME=VALUE, such as SIM_WIND_SPD=6")
+        found[name.strip().upper()] = number
+    return found
+
+
 async def run_vehicle(settings: VehicleSettings, *, stop: asyncio.Event | None = None) -> None:
     """Simulate until `stop` is set or the task is cancelled."""
     settings.check()
-    copter = SimCopter(
+    await Simulation(settings, make_vehicle(settings)).run(asyncio.Event() if stop is None else stop)
+
+
+def make_vehicle(settings: VehicleSettings) -> AnyAutopilot:
+    """Make the vehicle that the settings describe; ConfigError for a parameter that it does not have."""
+    kind = SimCopter if settings.kind == "copter" else SimRover
+    vehicle = kind(
         system=settings.system,
         site=settings.site,
         home=start_point(settings.site, settings.start),
         battery_percent=settings.battery_percent,
     )
-    await Simulation(settings, copter).run(asyncio.Event() if stop is None else stop)
+    for name, value in settings.parameters.items():
+        if name not in vehicle.parameters.values:
+            known = ", ".join(sorted(vehicle.parameters.values))
+            raise ConfigError(f"a simulated {settings.kind} has no parameter {name!r}", remedy=f"known: {known}")
+        vehicle.parameters.values[name] = float(value)
+    return vehicle
 
 
 class Simulation:
-    """Drives one copter by the clock and carries its messages."""
+    """Drives one vehicle by the clock and carries its messages, and those of what is on board."""
 
-    def __init__(self, settings: VehicleSettings, copter: SimCopter) -> None:
-        self.copter = copter
+    def __init__(self, settings: VehicleSettings, vehicle: AnyAutopilot) -> None:
+        self.vehicle = vehicle
+        self.parts: list[Component] = [SimCamera(vehicle), SimGimbal(vehicle)] if settings.camera else []
         self._settings = settings
-        self._chance = random.Random(settings.seed)  # noqa: S311 - a lossy link, no secret
+        self._down: Channel[bytes] = Channel(settings.air, direction=0)
+        self._up: Channel[Frame] = Channel(settings.air, direction=1)
         self._intervals = {name: 1.0 / hz for name, hz in STREAMS_HZ.items()}
         self._due = dict.fromkeys(STREAMS_HZ, 0.0)
         self._link: Link | None = None
+        self._codecs: dict[int, Codec] = {}
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until `stop` is set."""
         signer = Signer(read_key(self._settings.signing), link_id=0) if self._settings.signing else None
-        codec = Codec(self._settings.system, dialect.COMPONENT_AUTOPILOT, signer=signer)
+        for number in (dialect.COMPONENT_AUTOPILOT, *(part.number for part in self.parts)):
+            self._codecs[number] = Codec(self._settings.system, number, signer=signer)
+        codec = self._codecs[dialect.COMPONENT_AUTOPILOT]
         self._link = await open_link(self._settings.remote, codec, self._heard)
-        log.info("simulated copter", system=self._settings.system, to=self._settings.to)
+        log.info("simulated vehicle", kind=self._settings.kind, system=self._settings.system, to=self._settings.to)
         began = before = time.monotonic()
         try:
             while not stop.is_set():
                 now = time.monotonic()
                 dt = min(now - before, _LATE_S) * self._settings.rate
                 before = now
-                self._send(self.copter.step(dt, now))
-                for name, interval in self._intervals.items():
-                    if interval > 0 and now >= self._due[name]:
-                        # Late ticks do not add up to bursts.
-                        self._due[name] = max(self._due[name] + interval, now)
-                        self._send([telemetry(self.copter, name, round((now - began) * 1000))])
+                self._arrived(now)
+                self._tick(dt, now, round((now - began) * 1000))
+                self._transmit(now)
                 try:
                     async with asyncio.timeout(TICK_S):
                         await stop.wait()
@@ -126,13 +174,44 @@ class Simulation:
         finally:
             await self._link.close()
 
+    def _tick(self, dt: float, now: float, boot_ms: int) -> None:
+        """Let time pass on board, and send what is due."""
+        vehicle = self.vehicle
+        self._send(vehicle.step(dt, now))
+        for part in self.parts:
+            self._send(part.step(dt, now), part.number)
+        if vehicle.pictures and self.parts:
+            # The camera is the autopilot's to release, in missions and where it is addressed itself.
+            camera = self.parts[0]
+            if isinstance(camera, SimCamera):
+                self._send([camera.take() for _ in range(vehicle.pictures)], camera.number)
+            vehicle.pictures = 0
+        for name, interval in self._intervals.items():
+            if interval > 0 and now >= self._due[name]:
+                # Late ticks do not add up to bursts.
+                self._due[name] = max(self._due[name] + interval, now)
+                self._send([telemetry(vehicle, name, boot_ms)])
+
     def _heard(self, frame: Frame, address: tuple[str, int]) -> None:
         del address
-        if self._lost():
-            return
-        if frame.name == "COMMAND_LONG" and frame.message.command == dialect.SET_INTERVAL:
-            self._set_interval(frame.message)
-        self._send(self.copter.handle(frame, time.monotonic()))
+        now = time.monotonic()
+        self._up.send(frame, now)
+        self._arrived(now)
+        self._transmit(now)
+
+    def _arrived(self, now: float) -> None:
+        """Act on what has come through the air."""
+        for frame in self._up.due(now):
+            message = frame.message
+            if (
+                frame.name == "COMMAND_LONG"
+                and message.command == dialect.SET_INTERVAL
+                and message.target_component in (0, dialect.COMPONENT_AUTOPILOT)
+            ):
+                self._set_interval(message)
+            self._send(self.vehicle.handle(frame, now))
+            for part in self.parts:
+                self._send(part.handle(frame), part.number)
 
     def _set_interval(self, message: Message) -> None:
         """Take a wish for a stream: microseconds, 0 for the usual, -1 for none."""
@@ -142,14 +221,16 @@ class Simulation:
             wish = float(message.param2)
             self._intervals[name] = 1.0 / STREAMS_HZ[name] if wish == 0 else max(wish / 1e6, 0.02) if wish > 0 else 0.0
 
-    def _send(self, messages: list[Message]) -> None:
+    def _send(self, messages: list[Message], component: int = dialect.COMPONENT_AUTOPILOT) -> None:
+        now = time.monotonic()
         for message in messages:
-            if self._link is None:
-                return
-            raw = self._link.codec.pack(message)
-            for other in self._link.others:
-                if not self._lost():  # a lost one was sent all the same, as the next sequence number tells
-                    self._link.transmit(raw, other)
+            # One that is lost on the way was sent all the same, as the next sequence number tells.
+            self._down.send(self._codecs[component].pack(message), now)
 
-    def _lost(self) -> bool:
-        return self._settings.drop > 0 and self._chance.random() < self._settings.drop
+    def _transmit(self, now: float) -> None:
+        """Hand over what has come through the air to whoever is there."""
+        if self._link is None:
+            return
+        for raw in self._down.due(now):
+            for other in self._link.others:
+                self._link.transmit(raw, other)

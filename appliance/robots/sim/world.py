@@ -1,4 +1,4 @@
-"""The small world of simulated robots: things of a site, who holds them, and what may be done with them.
+"""The small world of simulated robots: things of a site, who holds them, doors, devices, and the people about.
 
 Every simulated robot has its own copy, made of the site's objects; what one robot does to a thing it puts on the
 plane, and the others follow. Two that act at once are told apart by a counter and the writer's name, so all copies
@@ -6,21 +6,26 @@ end equal (last writer wins, Lamport's order). Pure.
 """
 
 import math
+import re
 from collections.abc import Iterable
 
 import msgspec
 from msgspec import Struct
 
-from appliance.model import Box, Pose, Site
-from appliance.robots.geo import bearing_deg, inside
+from appliance.model import Box, Person, Pose, Site
+from appliance.model.geo import bearing_deg, inside
 from appliance.robots.verbs import RobotFailure
 
+OPEN, CLOSED, ON, OFF = "open", "closed", "on", "off"
+HEARING_M = 6.0
+"""How far a robot's voice carries, and the answer."""
 REACH_M = 1.5
 """How far the arm reaches from the robot's middle."""
 _RING_M = 0.9
 """Things stand this far from the middle of their place, where robots stop."""
 _TURNS = 12
 _APART_M = 0.7
+_WORD = re.compile(r"[a-z0-9]+")
 _HERE = frozenset({"here", "floor", "ground"})
 
 
@@ -33,6 +38,8 @@ class Thing(Struct, frozen=True, kw_only=True):
     x: float
     y: float
     holder: str = ""
+    state: str = ""
+    """Of a door `open` or `closed`, of a device `on` or `off`; empty for what has no state."""
     counter: int = 0
     writer: str = ""
 
@@ -60,6 +67,25 @@ class World:
             place = site.find(item.at)
             x, y = (0.0, 0.0) if place is None else self.free_spot(place.x, place.y)
             self._things[words(item.name)] = Thing(name=item.name, colour=item.colour, size=item.size, x=x, y=y)
+        for door in site.doors:
+            x, y = sum(door.x) / 2, sum(door.y) / 2
+            size = max(door.x[1] - door.x[0], door.y[1] - door.y[0])
+            state = OPEN if door.open else CLOSED
+            self._things[words(door.name)] = Thing(name=door.name, colour="brown", size=size, x=x, y=y, state=state)
+        for device in site.devices:
+            place = site.find(device.at)
+            x, y = (0.0, 0.0) if place is None else (place.x, place.y)
+            state = ON if device.on else OFF
+            self._things[words(device.name)] = Thing(name=device.name, colour="grey", size=0.2, x=x, y=y, state=state)
+
+    @property
+    def shut(self) -> tuple[Box, ...]:
+        """Doors that are shut: obstacles for who drives."""
+        return tuple(
+            Box(name=f"the shut {door.name}", x=door.x, y=door.y)
+            for door in self.site.doors
+            if self._things[words(door.name)].state == CLOSED
+        )
 
     @property
     def things(self) -> tuple[Thing, ...]:
@@ -97,9 +123,10 @@ class World:
         """Return the thing that can be picked; RobotFailure says why not."""
         held = self.held_by(robot)
         thing = self.find(name, pose.x, pose.y)
-        if thing is None:
+        if thing is None or thing.state:
+            movable = [each for each in self.things if not each.state]
             raise RobotFailure(
-                "not-found", f"there is no {name[:60]!r} here", remedy=f"there are: {_names(self.things)}"
+                "not-found", f"there is no {name[:60]!r} here to be picked", remedy=f"there are: {_names(movable)}"
             )
         if held is not None:
             raise RobotFailure(
@@ -142,6 +169,78 @@ class World:
     def place(self, robot: str, thing: Thing, x: float, y: float) -> Thing:
         """Put the thing down; returns the change to tell the others."""
         return self._change(thing, robot, x=round(x, 3), y=round(y, 3), holder="")
+
+    def check_switch(self, name: str, pose: Pose, *, states: tuple[str, str]) -> Thing:
+        """Return the door or device of that name that is within reach; RobotFailure says why not.
+
+        Args:
+            name: what it is called.
+            pose: where the robot is.
+            states: the states that such a thing can have.
+        """
+        fitting = [each for each in self.things if each.state in states]
+        thing = self._things.get(words(name))
+        if thing is None or thing not in fitting:
+            wanted = set(words(name).split())
+            near = [each for each in fitting if wanted and wanted <= set(words(each.name).split())]
+            thing = min(near, key=lambda each: math.hypot(each.x - pose.x, each.y - pose.y), default=None)
+        if thing is None:
+            raise RobotFailure(
+                "not-found", f"there is no {name[:60]!r} here for that", remedy=f"there are: {_names(fitting)}"
+            )
+        distance = self._distance(thing, pose)
+        if distance > REACH_M:
+            near_place = self.nearest_place(thing.x, thing.y)
+            raise RobotFailure(
+                "robot",
+                f"the {thing.name} is {distance:.1f} m away, the arm reaches {REACH_M:g} m",
+                remedy=f"drive to {near_place} first" if near_place else "drive there first",
+            )
+        return thing
+
+    def switch(self, robot: str, thing: Thing, state: str) -> Thing:
+        """Bring a door or device into a state; returns the change to tell the others."""
+        return self._change(thing, robot, state=state)
+
+    def _distance(self, thing: Thing, pose: Pose) -> float:
+        """Metres to a thing; to a door from its nearest edge."""
+        door = next((each for each in self.site.doors if words(each.name) == words(thing.name)), None)
+        if door is None:
+            return math.hypot(thing.x - pose.x, thing.y - pose.y)
+        x = max(door.x[0], min(door.x[1], pose.x))
+        y = max(door.y[0], min(door.y[1], pose.y))
+        return math.hypot(x - pose.x, y - pose.y)
+
+    def person(self, name: str, pose: Pose, *, within: float = HEARING_M) -> Person:
+        """Return the person of that name (none given: the nearest) within metres; RobotFailure says why not."""
+        wanted = words(name)
+        spots = [(each, self.site.find(each.at)) for each in self.site.people]
+        near = {each.name: math.hypot(place.x - pose.x, place.y - pose.y) for each, place in spots if place is not None}
+        chosen = [each for each, _ in spots if each.name in near and (not wanted or words(each.name) == wanted)]
+        if not chosen:
+            known = ", ".join(sorted(near)) or "nobody"
+            raise RobotFailure("not-found", f"there is no {name[:60]!r} about", remedy=f"there are: {known}")
+        person = min(chosen, key=lambda each: near[each.name])
+        if near[person.name] > within:
+            raise RobotFailure(
+                "robot",
+                f"{person.name} is {near[person.name]:.1f} m away, {within:g} m are near enough",
+                remedy=f"drive to {person.at} first",
+            )
+        return person
+
+    def check_give(self, robot: str, name: str, to: str, pose: Pose) -> tuple[Thing, Person]:
+        """Return the held thing and the person it is for; RobotFailure says why not."""
+        held = self.held_by(robot)
+        if held is None:
+            raise RobotFailure("robot", f"{robot} holds nothing", remedy=f"pick the {name[:60]} first")
+        if words(name) not in words(held.name):
+            raise RobotFailure("robot", f"{robot} holds the {held.name}, not the {name[:60]}")
+        return held, self.person(to, pose, within=2 * REACH_M)
+
+    def give(self, robot: str, thing: Thing, person: Person) -> Thing:
+        """Put the thing into a person's hands; returns the change to tell the others."""
+        return self._change(thing, robot, holder=person.name)
 
     def carry(self, robot: str, pose: Pose) -> None:
         """Let what a robot holds move with it; the others hear of it when it is put down."""
@@ -191,6 +290,14 @@ class World:
         change = msgspec.structs.replace(thing, counter=thing.counter + 1, writer=writer, **changes)
         self._things[words(thing.name)] = change
         return change
+
+
+def answer(person: Person, question: str) -> str:
+    """Return what a person says to a question: the entry most of whose words are in it, "" when they have none."""
+    asked = set(_WORD.findall(question.lower()))
+    fitting = [key for key in person.answers if set(_WORD.findall(key.lower())) <= asked]
+    best = max(fitting, key=lambda key: (len(_WORD.findall(key)), key), default=None)
+    return "" if best is None else person.answers[best]
 
 
 class Aim(Struct, frozen=True):

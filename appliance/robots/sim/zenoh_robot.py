@@ -17,14 +17,17 @@ from msgspec import Struct, field
 
 from appliance.errors import ConfigError, UnreachableError
 from appliance.model import Pose, RobotInfo, Site, encode
+from appliance.model.geo import blocked_leg
 from appliance.plane.keys import check_name
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.robots.commands import CommandDesk, Done, Verb
-from appliance.robots.geo import blocked_leg
+from appliance.robots.commands import UNREADABLE, CommandDesk, Done, Verb
 from appliance.robots.ledger import Ledger
+from appliance.robots.policy import check_velocity, check_way
 from appliance.robots.sim import camera
+from appliance.robots.sim.around import Around
 from appliance.robots.sim.driving import Driving
+from appliance.robots.sim.ears import Ears
 from appliance.robots.sim.mavlink import start_point
 from appliance.robots.sim.world import Aim, Thing, Things, World, aim, words
 from appliance.robots.verbs import (
@@ -38,7 +41,7 @@ from appliance.robots.verbs import (
     PlaceArgs,
     RecordArgs,
     RobotFailure,
-    check_way,
+    VelocityArgs,
     in_range,
 )
 
@@ -121,6 +124,9 @@ class Rover:
         self._rate = settings.rate
         self._session = session
         self._trail: list[tuple[float, float]] = []
+        self._around = Around(
+            self.name, self.world, pose=lambda: self.driving.pose, wait=self._wait, announce=self._announce
+        )
         self.desk = CommandDesk(
             self.name,
             session=session,
@@ -137,10 +143,12 @@ class Rover:
             "goto": Verb(run=self._goto, uses=("base",), resumable=True),
             "return_home": Verb(run=self._return_home, uses=("base",), resumable=True),
             "hold": Verb(run=self._hold, uses=("base",), resumable=True, preempts=True),
+            "velocity": Verb(run=self._velocity, uses=("base",), preempts=True),
             "pick": Verb(run=self._pick, uses=("arm",)),
             "place": Verb(run=self._place, uses=("arm",)),
             "capture": Verb(run=self._capture, uses=("camera",), resumable=True),
             "record": Verb(run=self._record, uses=("camera",), resumable=True),
+            **self._around.verbs(),
         }
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -157,6 +165,9 @@ class Rover:
             ):
                 stack.callback(closer.close)
             stack.push_async_callback(self.desk.close)
+            ears = Ears(self.name, self._around, session)
+            ears.listen()
+            stack.push_async_callback(ears.close)
             log.info("simulated rover", robot=self.name, at=self.home)
             await self._live(stop)
 
@@ -185,9 +196,10 @@ class Rover:
         return RobotInfo(
             id=self.name,
             kind="zenoh",
-            uses=("base", "arm", "camera"),
+            uses=("base", "arm", "camera", "speaker", "microphone"),
             verbs=(*self.desk.verbs, "stop"),
             pose=self.driving.pose,
+            home=Pose(x=self.home[0], y=self.home[1]),
             battery_percent=round(self.driving.battery_percent, 1),
             armed=True,
             mode=busy[0] if busy else "idle",
@@ -210,8 +222,13 @@ class Rover:
         info = self.info()
         return Done({**msgspec.to_builtins(info), "flies": False, "online": True} | self._where())
 
+    def _open_site(self) -> Site:
+        """The site as it is now: a door that is shut is an obstacle."""
+        shut = self.world.shut
+        return msgspec.structs.replace(self._site, obstacles=(*self._site.obstacles, *shut)) if shut else self._site
+
     async def _goto(self, args: GotoArgs) -> Done:
-        points = check_way(self._site, self.driving.pose, args, flies=False)
+        points = check_way(self._open_site(), self.driving.pose, args, flies=False)
         driven = self.driving.driven_m
         way = [(point.x, point.y) for point in points]
         await self._drive(way, args.speed_mps)
@@ -219,7 +236,7 @@ class Rover:
 
     async def _return_home(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         here = (self.driving.x, self.driving.y)
-        closed = (*self._site.forbidden, *self._site.obstacles)
+        closed = (*self._site.forbidden, *self._open_site().obstacles)
         # It plans no ways of its own: straight where nothing is between, else back the way it came.
         way = [self.home] if blocked_leg(closed, here, [self.home]) is None else [*reversed(self._trail), self.home]
         await self._drive(way, None)
@@ -244,6 +261,16 @@ class Rover:
         self.driving.halt()
         await self._wait(args.duration_s or 0.0)
         return Done({"held_s": args.duration_s or 0.0} | self._where())
+
+    async def _velocity(self, args: VelocityArgs) -> Done:
+        east, north, _ = check_velocity(self._open_site(), self.driving.pose, args, flies=False)
+        self.driving.by_hand(east, north, args.turn_dps)
+        try:
+            # Real seconds, whatever the rate: a person's hand is on it.
+            await asyncio.sleep(args.for_s)
+        finally:
+            self.driving.halt()
+        return Done({"moved_s": args.for_s} | self._where())
 
     async def _halt(self) -> None:
         self.driving.halt()
@@ -281,7 +308,7 @@ class Rover:
         for message in await self._session.query_all(self._session.keys.world_of(), b"", timeout_s=_SNAPSHOT_S):
             try:
                 told = msgspec.json.decode(message.payload, type=Things)
-            except msgspec.DecodeError as error:
+            except UNREADABLE as error:
                 self.refused["world_malformed"] = self.refused.get("world_malformed", 0) + 1
                 log.warning("world of another robot unreadable", key=message.key, error=str(error))
                 continue

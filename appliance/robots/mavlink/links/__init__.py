@@ -1,4 +1,4 @@
-"""MAVLink links: UDP and TCP, listening and connecting, behind one door.
+"""MAVLink links: UDP and TCP, listening and connecting, and serial ports, behind one door.
 
 `open_link` makes the link that a setting names. Frames are checked and counted in it, once, before anybody acts on
 them: what is damaged, of an unknown dialect or signed is counted by kind and dropped, and the stream goes on. Who a
@@ -7,8 +7,10 @@ frame is from is for the caller to judge.
 
 from collections.abc import Callable
 
+from appliance.robots.mavlink.address import Address
 from appliance.robots.mavlink.dialect import Codec, Frame
-from appliance.robots.mavlink.links.base import Address, Link
+from appliance.robots.mavlink.links.base import Link
+from appliance.robots.mavlink.links.serial import SerialLink
 from appliance.robots.mavlink.links.tcp import TcpClient, TcpServer
 from appliance.robots.mavlink.links.udp import UdpClient, UdpServer
 from appliance.robots.settings import Remote
@@ -20,6 +22,7 @@ _KINDS: dict[tuple[str, bool], type[Link]] = {
     ("udp", False): UdpClient,
     ("tcp", True): TcpServer,
     ("tcp", False): TcpClient,
+    ("serial", False): SerialLink,
 }
 
 
@@ -28,6 +31,9 @@ async def open_link(
     codec: Codec,
     on_frame: Callable[[Frame, Address], None],
     refused: dict[str, int] | None = None,
+    *,
+    limit_hz: float = 0.0,
+    busy: Callable[[], bool] = lambda: False,
 ) -> Link:
     """Open the link that a setting names.
 
@@ -36,11 +42,14 @@ async def open_link(
         codec: decoder and encoder of this link alone.
         on_frame: told each good frame and who sent it, on the event loop.
         refused: counters of bad input by kind.
+        limit_hz: most frames a second from one end: more of a datagram link are dropped and counted as `flood`, of a
+            stream they are read later. 0 for no limit.
+        busy: whether no more can be taken just now; streams are then read later.
 
     Raises:
         ConfigError: the port to listen on is taken or not this machine's. A link that connects does not raise: it
             tries for as long as it is open.
     """
-    link = _KINDS[remote.scheme, remote.listens](remote, codec, on_frame, refused)
+    link = _KINDS[remote.scheme, remote.listens](remote, codec, on_frame, refused, limit_hz=limit_hz, busy=busy)
     await link.open()
     return link

@@ -1,18 +1,31 @@
 """What all links have in common."""
 
 import abc
+import asyncio
 from collections.abc import Callable
 
 from appliance.errors import ConfigError
+from appliance.robots.mavlink.address import Address
 from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Message
+from appliance.robots.mavlink.stats import Limiter, LinkStats
 from appliance.robots.settings import Remote
 
-Address = tuple[str, int]
-"""Host and port of the other end."""
+__all__ = ["Address", "Link"]
+
+_BUSY_S = 0.005
 
 
 class Link(abc.ABC):
-    """One link. `on_frame(frame, address)` runs on the event loop for each good frame."""
+    """One link. `on_frame(frame, address)` runs on the event loop for each good frame.
+
+    Args:
+        remote: where it is.
+        codec: decoder and encoder of this link alone.
+        on_frame: told each good frame, and whose it is.
+        refused: counters of bad input by kind, of all links together; its own are `damaged`.
+        limit_hz: most frames a second from one end; 0 for no limit.
+        busy: whether no more can be taken just now, so that streams are not read; datagrams cannot wait.
+    """
 
     def __init__(
         self,
@@ -20,12 +33,33 @@ class Link(abc.ABC):
         codec: Codec,
         on_frame: Callable[[Frame, Address], None],
         refused: dict[str, int] | None = None,
+        *,
+        limit_hz: float = 0.0,
+        busy: Callable[[], bool] = lambda: False,
     ) -> None:
         self.remote = remote
         self.codec = codec
-        self.received = 0
         self.refused: dict[str, int] = {} if refused is None else refused
+        self.damaged: dict[str, int] = {}
+        self.stats = LinkStats(self.now())
+        self.problem = ""
+        """Why nothing is heard just now, where that is known."""
         self._on_frame = on_frame
+        self._limiter = Limiter(limit_hz)
+        self._busy = busy
+
+    @staticmethod
+    def now() -> float:
+        """Monotonic seconds, as the event loop counts them."""
+        try:
+            return asyncio.get_running_loop().time()
+        except RuntimeError:
+            return 0.0
+
+    @property
+    def received(self) -> int:
+        """Good frames so far."""
+        return self.stats.frames_in
 
     @abc.abstractmethod
     async def open(self) -> None:
@@ -42,12 +76,18 @@ class Link(abc.ABC):
         """Other ends that are known before they have been heard: they are sent heartbeats, so that they know us."""
 
     @abc.abstractmethod
-    def transmit(self, raw: bytes, to: Address) -> None:
-        """Send a frame as it is; links lose frames, so nothing is raised for one that cannot be sent."""
+    def _write(self, raw: bytes, to: Address) -> bool:
+        """Send bytes; False when they were dropped."""
 
     @abc.abstractmethod
     async def close(self) -> None:
         """Close everything; a port is free when it returns."""
+
+    def transmit(self, raw: bytes, to: Address) -> None:
+        """Send a frame as it is; links lose frames, so nothing is raised for one that cannot be sent."""
+        if self._write(raw, to):
+            self.stats.frames_out += 1
+            self.stats.bytes_out += len(raw)
 
     def send(self, message: Message, to: Address, *, system: int | None = None) -> bytes:
         """Send one message and return its frame; `system` as in `Codec.pack`."""
@@ -57,6 +97,7 @@ class Link(abc.ABC):
 
     def count(self, kind: str) -> None:
         """Count one piece of bad input."""
+        self.damaged[kind] = self.damaged.get(kind, 0) + 1
         self.refused[kind] = self.refused.get(kind, 0) + 1
 
     def take(self, found: Frame | Damage, address: Address) -> None:
@@ -64,13 +105,33 @@ class Link(abc.ABC):
         if isinstance(found, Damage):
             self.count(found.kind)
         else:
-            self.received += 1
+            stats = self.stats
+            stats.frames_in += 1
+            stats.bytes_in += len(found.raw)
             self._on_frame(found, address)
 
     def feed(self, data: bytes, address: Address) -> None:
-        """Take in bytes as if they had come in a datagram."""
+        """Take in a datagram; those of an end that sends more than it may are dropped and counted."""
+        now = self.now()
+        if self._limiter.wait_s(address, now):
+            self.count("flood")
+            return
+        found = 0
         for each in self.codec.read(data):
+            found += 1
             self.take(each, address)
+        self._limiter.spent(address, found, now)
+
+    async def pace(self, address: Address, frames: int) -> None:
+        """Wait until an end of a stream may be read again: its own system then slows it down, and nothing is lost."""
+        now = self.now()
+        self._limiter.spent(address, frames, now)
+        wait_s = self._limiter.wait_s(address, now)
+        if wait_s:
+            self.count("slowed")
+            await asyncio.sleep(wait_s)
+        while self._busy():  # noqa: ASYNC110 - what it waits for is a thread's queue, which tells nobody
+            await asyncio.sleep(_BUSY_S)
 
     def taken(self, error: OSError) -> ConfigError:
         """The error for a port that cannot be listened on."""

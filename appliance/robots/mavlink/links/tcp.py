@@ -15,6 +15,8 @@ MAX_CONNECTIONS = 64
 """Of one listening port; more are refused and counted."""
 MAX_UNSENT = 256 * 1024
 """Bytes that may wait for an end that does not read; beyond it frames are dropped and counted, as on a radio link."""
+MAX_READ = 16 * 1024
+"""Bytes taken from one connection before the others have their turn: some 300 frames."""
 FIRST_RETRY_S = 0.5
 LAST_RETRY_S = 10.0
 
@@ -24,32 +26,55 @@ class _TcpLink(Link):
 
     def _begin(self) -> None:
         self._writers: dict[Address, asyncio.StreamWriter] = {}
+        self._unsent: dict[Address, bytearray] = {}
+        """Frames that go out together at the end of this turn of the loop: a system call costs more than a frame."""
 
     @property
     def others(self) -> tuple[Address, ...]:
         """The other ends of all connections: none of them speaks by accident."""
         return tuple(self._writers)
 
-    def transmit(self, raw: bytes, to: Address) -> None:
+    def _write(self, raw: bytes, to: Address) -> bool:
         """Send a frame on its connection, unless that is gone or stuck."""
         writer = self._writers.get(to)
         if writer is None or writer.is_closing():
-            return
-        if writer.transport.get_write_buffer_size() > MAX_UNSENT:
+            return False
+        unsent = self._unsent.get(to)
+        if writer.transport.get_write_buffer_size() + (len(unsent) if unsent else 0) > MAX_UNSENT:
             self.count("not_read")
-            return
-        writer.write(raw)
+            return False
+        if not self._unsent:
+            asyncio.get_running_loop().call_soon(self._flush)
+        if unsent is None:
+            unsent = self._unsent[to] = bytearray()
+        unsent += raw
+        return True
+
+    def _flush(self) -> None:
+        """Send what was written in this turn of the loop."""
+        unsent, self._unsent = self._unsent, {}
+        for to, frames in unsent.items():
+            writer = self._writers.get(to)
+            if writer is not None and not writer.is_closing():
+                writer.write(frames)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Read one connection to its end."""
-        address = cast("Address", writer.get_extra_info("peername")[:2])
+        peer = writer.get_extra_info("peername")
+        if peer is None:  # gone before it was looked at
+            writer.transport.abort()
+            return
+        address = cast("Address", peer[:2])
         stream = Stream(self.codec)
         self._writers[address] = writer
         log.info("MAVLink connection", link=str(self.remote), peer=f"{address[0]}:{address[1]}")
         try:
-            while data := await reader.read(65536):
+            while data := await reader.read(MAX_READ):
+                frames = 0
                 for found in stream.feed(data):
+                    frames += 1
                     self.take(found, address)
+                await self.pace(address, frames)
         except OSError as error:
             log.info("MAVLink connection broke", link=str(self.remote), reason=str(error))
         finally:
@@ -121,13 +146,14 @@ class TcpClient(_TcpLink):
             try:
                 reader, writer = await asyncio.open_connection(self.remote.host, self.remote.port)
             except OSError as error:
+                self.problem = str(error)
                 if str(error) != told:
                     told = str(error)
                     log.warning("MAVLink address cannot be reached", connect=str(self.remote), reason=told)
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, LAST_RETRY_S)
                 continue
-            pause_s, told = FIRST_RETRY_S, ""
+            pause_s, told, self.problem = FIRST_RETRY_S, "", ""
             await self._serve(reader, writer)
             await asyncio.sleep(pause_s)
 

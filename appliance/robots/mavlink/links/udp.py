@@ -1,6 +1,7 @@
 """MAVLink over UDP: a datagram holds whole frames."""
 
 import asyncio
+import socket
 from typing import Any, cast
 
 import structlog
@@ -9,6 +10,24 @@ from appliance.errors import ConfigError
 from appliance.robots.mavlink.links.base import Address, Link
 
 log = structlog.get_logger(__name__)
+
+MAX_UNSENT = 256 * 1024
+"""Bytes of datagrams that may wait for the system to take them; more are dropped, as on a radio link."""
+RECEIVE_BYTES = 4 * 2**20
+"""Asked of the system for datagrams that wait to be read: half a second of 100,000 frames. It gives what it allows."""
+
+
+def _full(transport: asyncio.DatagramTransport) -> bool:
+    """Whether as much waits to be sent as may."""
+    waiting: int = cast("Any", transport).get_write_buffer_size()  # both loops have it
+    return waiting > MAX_UNSENT
+
+
+def _widen(transport: asyncio.DatagramTransport) -> None:
+    """Ask for room for a burst; the system's own is 200 kB, which 800 small datagrams fill."""
+    sock = transport.get_extra_info("socket")
+    if sock is not None:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
 
 
 class _Datagrams(asyncio.DatagramProtocol):
@@ -41,11 +60,24 @@ class UdpServer(Link):
         """Bind the port."""
         loop = asyncio.get_running_loop()
         try:
-            self._transport, self._datagrams = await loop.create_datagram_endpoint(
-                lambda: _Datagrams(self), local_addr=(self.remote.host, self.remote.port)
-            )
+            sock = await self._bound(loop)
         except OSError as error:
             raise self.taken(error) from error
+        self._transport, self._datagrams = await loop.create_datagram_endpoint(lambda: _Datagrams(self), sock=sock)
+        _widen(self._transport)
+
+    async def _bound(self, loop: asyncio.AbstractEventLoop) -> socket.socket:
+        """A socket at the port: bound here, since an event loop may leave behind one that it could not bind."""
+        found = await loop.getaddrinfo(self.remote.host, self.remote.port, type=socket.SOCK_DGRAM)
+        family, kind, protocol, _, address = found[0]
+        sock = socket.socket(family, kind, protocol)
+        try:
+            sock.setblocking(False)
+            sock.bind(address)
+        except OSError:
+            sock.close()
+            raise
+        return sock
 
     @property
     def address(self) -> Address:
@@ -59,10 +91,12 @@ class UdpServer(Link):
         """Nobody is known before it was heard."""
         return ()
 
-    def transmit(self, raw: bytes, to: Address) -> None:
+    def _write(self, raw: bytes, to: Address) -> bool:
         """Send a datagram."""
-        if self._transport is not None:
-            self._transport.sendto(raw, to)
+        if self._transport is None or _full(self._transport):
+            return False
+        self._transport.sendto(raw, to)
+        return True
 
     async def close(self) -> None:
         """Close the socket."""
@@ -81,6 +115,7 @@ class UdpClient(Link):
     RETRY_S = 2.0
 
     _transport: asyncio.DatagramTransport | None = None
+    _other: Address | None = None
     _keeping: "asyncio.Task[None] | None" = None
 
     async def open(self) -> None:
@@ -96,16 +131,19 @@ class UdpClient(Link):
                     lambda: _Datagrams(self), remote_addr=(self.remote.host, self.remote.port)
                 )
             except OSError as error:
+                self.problem = str(error)
                 if str(error) != told:
                     told = str(error)
                     log.warning("MAVLink address cannot be reached", connect=str(self.remote), reason=told)
                 await asyncio.sleep(self.RETRY_S)
                 continue
-            self._transport, told = transport, ""
+            self._transport, told, self.problem = transport, "", ""
+            _widen(transport)
+            self._other = cast("Address", transport.get_extra_info("peername")[:2])
             try:
                 await datagrams.closed.wait()
             finally:
-                self._transport = None
+                self._transport = self._other = None
                 transport.abort()
             await asyncio.sleep(self.RETRY_S)
 
@@ -117,14 +155,14 @@ class UdpClient(Link):
     @property
     def others(self) -> tuple[Address, ...]:
         """The address it sends to, as the system resolved it."""
-        if self._transport is None:
-            return ()
-        return (cast("Address", self._transport.get_extra_info("peername")[:2]),)
+        return () if self._other is None else (self._other,)
 
-    def transmit(self, raw: bytes, to: Address) -> None:
+    def _write(self, raw: bytes, to: Address) -> bool:
         """Send a datagram."""
-        if self._transport is not None and to in self.others:
-            self._transport.sendto(raw)
+        if self._transport is None or to != self._other or _full(self._transport):
+            return False
+        self._transport.sendto(raw)
+        return True
 
     async def close(self) -> None:
         """Close the socket."""

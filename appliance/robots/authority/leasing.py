@@ -1,0 +1,262 @@
+"""Leases on one gateway: who takes a robot over is decided by compare-and-set on `lease/{robot}`; the rest is told.
+
+A lease that is not renewed ends by each gateway's own clock; the one that owns the robot's key then has it hold, and
+says so. Commands under a lease go through the gateway that the operator's tool asks, which checks it first.
+"""
+
+import asyncio
+import itertools
+import time
+import uuid
+from collections.abc import Callable
+
+import msgspec
+import structlog
+from msgspec.structs import replace
+
+from appliance.errors import ConflictError, NotFoundError, RefusedError, SwiftbotError
+from appliance.model import Lease, RobotCommand, RobotReply, encode
+from appliance.plane.node import Plane
+from appliance.plane.session import Closer
+from appliance.robots.authority.api import DriveAsk, GiveAsk, RenewAsk, TakeAsk
+from appliance.robots.authority.leases import GIVEN_BACK, Leases
+from appliance.robots.authority.telling import tell_to_hold
+from appliance.robots.commands import send_command
+
+log = structlog.get_logger(__name__)
+
+TICK_S = 0.2
+"""How often leases are looked at; a robot that is not commanded any more has held by itself long before."""
+GRACE_S = 3.0
+"""How long tasks wait to be told of the end of a lease that is over: longer than a robot may take to hold (`TELL_S`).
+Then the gateway that should tell it is gone, and the robot is free."""
+
+
+class Leasing:
+    """The leases as this gateway knows them. `changed` is called when who has a robot is another.
+
+    `refuses` says why a command may not be carried out just now: robots that speak Zenoh themselves do not know it.
+    `orders` holds it to the limits of its robot (`bounds`).
+    """
+
+    def __init__(
+        self,
+        plane: Plane,
+        *,
+        changed: Callable[[], None],
+        refuses: Callable[[str, RobotCommand], str],
+        orders: Callable[[str, RobotCommand], RobotCommand] = lambda _, command: command,
+    ) -> None:
+        self._orders = orders
+        self._plane = plane
+        self._changed = changed
+        self._refuses = refuses
+        self.leases = Leases()
+        self._numbers = itertools.count(1)
+        self._closer: Closer | None = None
+        self._ticking: asyncio.Task[None] | None = None
+        self._ending: set[asyncio.Task[None]] = set()
+
+    def start(self) -> None:
+        """Listen, and look at the clock."""
+        self._closer = self._plane.session.subscribe_typed(self._plane.keys.lease(), Lease, self._on_lease)
+        self._ticking = asyncio.create_task(self._tick(), name="leases of robots")
+
+    async def close(self) -> None:
+        """Listen no more."""
+        if self._closer is not None:
+            self._closer.close()
+        if self._ticking is not None:
+            self._ticking.cancel()
+            await asyncio.gather(self._ticking, return_exceptions=True)
+        for task in self._ending:
+            task.cancel()
+        await asyncio.gather(*self._ending, return_exceptions=True)
+
+    def merge(self, leases: tuple[Lease, ...]) -> None:
+        """Take in what another gateway knows."""
+        if self.leases.merge(leases, time.monotonic()):
+            self._changed()
+
+    async def take(self, ask: TakeAsk) -> Lease:
+        """Answer `control_take`.
+
+        Raises:
+            NotFoundError: no such robot is in the roster.
+            ConflictError: somebody has it; the message says who.
+        """
+        if ask.robot not in self._plane.registry.robots:
+            known = ", ".join(sorted(self._plane.registry.robots)) or "none"
+            raise NotFoundError(f"no robot {ask.robot[:60]!r} is in the roster", remedy=f"there are: {known}")
+        lease = Lease(
+            id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
+            robot=ask.robot,
+            by=ask.by,
+            why=ask.why,
+            lease_s=ask.lease_s,
+            at_ns=time.time_ns(),
+        )
+        if (held := self.leases.of(ask.robot)) is not None:
+            if held.id == lease.id:
+                return held
+            raise self._taken(held)
+        stored = await self._plane.dht.read(_key(ask.robot))
+        known = _read(stored.value) if stored is not None and not stored.deleted else None
+        if known is not None and not known.ended and known.id != lease.id:
+            # Not heard of here yet, or lost with the gateway that was asked: it holds as long as it says from now on.
+            self._hear(known)
+            if (held := self.leases.of(ask.robot)) is not None:
+                raise self._taken(held)
+        if known is None or known.id != lease.id:
+            try:
+                expected = stored.version if stored is not None else None
+                await self._plane.dht.write(_key(ask.robot), encode(lease), expected=expected)
+            except ConflictError:
+                again = await self._plane.dht.read(_key(ask.robot))
+                winner = _read(again.value) if again is not None else None
+                if winner is not None and not winner.ended:
+                    self._hear(winner)
+                    raise self._taken(winner) from None
+                raise
+        self._hear(lease)
+        self._plane.session.put(self._plane.keys.lease(lease.robot), encode(lease))
+        log.warning("robot taken over", robot=lease.robot, by=lease.by, why=lease.why, lease_s=lease.lease_s)
+        await self._have_hold(lease.robot, lease.id)
+        return lease
+
+    async def renew(self, ask: RenewAsk) -> Lease:
+        """Answer `control_renew`; ConflictError when the lease has ended, or is about to since its time is over."""
+        held = await self._held(ask.robot, ask.lease)
+        if self.leases.left_s(ask.robot, time.monotonic()) <= 0:
+            raise _over(ask.robot)
+        renewed = replace(held, renewal=held.renewal + 1)
+        self._hear(renewed)
+        self._plane.session.put(self._plane.keys.lease(renewed.robot), encode(renewed))
+        return renewed
+
+    async def give(self, ask: GiveAsk) -> Lease:
+        """Answer `control_give`: the robot holds first, then it is the tasks' again; given twice is given once."""
+        try:
+            held = await self._held(ask.robot, ask.lease)
+        except ConflictError:
+            now = self.leases.of(ask.robot)
+            if now is not None:
+                raise
+            return Lease(id=ask.lease, robot=ask.robot, by=ask.by, ended=GIVEN_BACK)
+        await self._have_hold(held.robot, f"{held.id}~back")
+        return await self._end(replace(held, ended=GIVEN_BACK, why=ask.why or held.why))
+
+    async def move(self, ask: DriveAsk) -> RobotReply:
+        """Answer `control_move`; what the robot cannot is in its reply.
+
+        Raises:
+            ConflictError: the lease has ended.
+            RefusedError: a soft stop holds the robot, or it is above a limit.
+        """
+        held = await self._held(ask.robot, ask.lease)
+        command = RobotCommand(
+            id=f"{held.id}~{self._plane.gateway}~{time.time_ns()}~{next(self._numbers)}"[:200],
+            verb=ask.verb,
+            args=ask.args,
+            lease=held.id,
+        )
+        if why := self._refuses(ask.robot, command):
+            raise RefusedError(f"{ask.robot} is {why}", remedy="it moves when that is lifted: `swiftbot resume`")
+        command = self._orders(ask.robot, command)
+        return await send_command(self._plane.session, ask.robot, command, timeout_s=ask.timeout_s)
+
+    async def _held(self, robot: str, lease: str) -> Lease:
+        held = self.leases.of(robot)
+        if held is None:
+            stored = await self._plane.dht.read(_key(robot))
+            known = _read(stored.value) if stored is not None and not stored.deleted else None
+            if known is not None and known.id == lease and not known.ended:
+                self._hear(known)
+                held = self.leases.of(robot)
+        if held is None:
+            raise _over(robot)
+        if held.id != lease:
+            raise self._taken(held)
+        return held
+
+    def _taken(self, held: Lease) -> ConflictError:
+        left_s = self.leases.left_s(held.robot, time.monotonic())
+        return ConflictError(
+            f"{held.robot} is {held.text}",
+            remedy=f"ask them to give it back; without a renewal it is free in {left_s:.0f} s",
+        )
+
+    def _hear(self, lease: Lease) -> None:
+        if self.leases.hear(lease, time.monotonic()):
+            self._changed()
+
+    def _on_lease(self, key: str, lease: Lease | None) -> None:
+        if lease is None:
+            return
+        if not key.endswith(f"/{lease.robot}"):
+            self._plane.session.refuse("misplaced operator/lease/*", key=key, says=lease.robot)
+            return
+        self._hear(lease)
+
+    async def _tick(self) -> None:
+        while True:
+            await asyncio.sleep(TICK_S)
+            try:
+                self._look(time.monotonic())
+            except Exception:  # supervision boundary: leases that never end would keep robots from their tasks
+                log.exception("looking at the leases broke; it goes on")
+
+    def _look(self, now: float) -> None:
+        """Have robots hold whose lease is over; only when that is told, or after a grace, are they the tasks' again."""
+        for each in self.leases.due(now):
+            if self._plane.dht.owns(f"robot/{each.robot}"):
+                log.warning("a lease was not renewed: the robot holds", robot=each.robot, by=each.by)
+                task = asyncio.create_task(self._end_over(self.leases.end(each)), name=f"lease of {each.robot}")
+                self._ending.add(task)
+                task.add_done_callback(self._ending.discard)
+        if gone := self.leases.expire(now, GRACE_S):
+            for each in gone:
+                log.warning("a lease is over, and nobody told its end: the robot is free", robot=each.robot, by=each.by)
+            self._changed()
+
+    async def _end_over(self, ended: Lease) -> None:
+        try:
+            await self._have_hold(ended.robot, f"{ended.id}~over")
+            await self._end(ended)
+        except SwiftbotError as error:
+            log.warning("the end of a lease is not written", robot=ended.robot, reason=str(error))
+        except Exception:  # supervision boundary: it ends by the grace all the same
+            log.exception("ending a lease broke", robot=ended.robot)
+
+    async def _end(self, ended: Lease) -> Lease:
+        self._hear(ended)
+        self._plane.session.put(self._plane.keys.lease(ended.robot), encode(ended))
+        stored = await self._plane.dht.read(_key(ended.robot))
+        known = _read(stored.value) if stored is not None and not stored.deleted else None
+        if stored is not None and known is not None and known.id == ended.id:
+            try:
+                await self._plane.dht.write(_key(ended.robot), encode(ended), expected=stored.version)
+            except ConflictError:
+                log.info("somebody has taken the robot meanwhile", robot=ended.robot)
+        log.warning("robot given back", robot=ended.robot, by=ended.by, how=ended.ended)
+        return ended
+
+    async def _have_hold(self, robot: str, act: str) -> None:
+        _, problems = await tell_to_hold(self._plane.session, (robot,), act=act)
+        for reason in problems.values():
+            log.warning("a robot does not confirm that it holds", robot=robot, reason=reason)
+
+
+def _over(robot: str) -> ConflictError:
+    return ConflictError(f"the lease of {robot[:60]} has ended", remedy="take it over again")
+
+
+def _key(robot: str) -> str:
+    return f"lease/{robot}"
+
+
+def _read(value: bytes) -> Lease | None:
+    try:
+        return msgspec.json.decode(value, type=Lease)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None

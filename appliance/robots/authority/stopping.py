@@ -1,0 +1,236 @@
+"""Soft stops on one gateway: kept on disk, told to every gateway, and to the robots until they say that they hold.
+
+A stop is put by whoever gives it before anybody is asked, so each gateway that hears it acts on it by itself; the
+gateway that is asked besides confirms which others have it on disk and which robots hold. What was missed is made up
+for when gateways meet (`authority`).
+"""
+
+import asyncio
+import itertools
+import time
+import uuid
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from typing import Any
+
+import msgspec
+import structlog
+
+from appliance.errors import RefusedError, SwiftbotError
+from appliance.model import Lifted, SoftStop, encode
+from appliance.plane.node import Plane
+from appliance.plane.session import Closer
+from appliance.robots.authority.api import ResumeRobotsAsk, Standing, StandingAsk, StopAnswer, StopAsk
+from appliance.robots.authority.stops import Stops
+from appliance.robots.authority.telling import tell_to_hold
+
+log = structlog.get_logger(__name__)
+
+STORED = "authority/stops"
+CONFIRM_S = 1.5
+"""How long another gateway may take to confirm; one that is slower hears it by the put."""
+AGAIN_S = (0.0, 0.5, 1.0)
+"""The first pauses before robots are looked at that have not confirmed that they hold."""
+EVERY_S = 1.0
+"""The pauses after these, as long as the stop is in force: for robots and gateways that were away."""
+_ABSENT = "it is not in the roster and could not be told; it will be if it comes while the stop is in force"
+_AWAY = (
+    "it is offline and could not be told; it will be when it is back while the stop is in force, and until then its "
+    "own failsafe has it"
+)
+
+
+class Stopping:
+    """The soft stops as this gateway knows them. `changed` is called when they are others."""
+
+    def __init__(self, plane: Plane, *, changed: Callable[[], None]) -> None:
+        self._plane = plane
+        self._changed = changed
+        self.stops = Stops()
+        self._closers: list[Closer] = []
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._held: dict[str, set[str]] = {}
+        """Stop that is pursued -> robots that have confirmed that they hold, and are here since."""
+        self._writing = asyncio.Lock()
+
+    async def start(self) -> None:
+        """Take up what was kept, and listen."""
+        for _, value in await self._plane.store.scan(STORED):
+            try:
+                kept = msgspec.json.decode(value, type=StandingAsk)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                log.warning("kept soft stops cannot be read; the others are asked", reason=str(error))
+                continue
+            self.stops.merge(kept.stops, kept.lifted)
+        session, keys = self._plane.session, self._plane.keys
+        self._closers = [
+            session.subscribe_typed(keys.soft_stop(), SoftStop, self._on_stop),
+            session.subscribe_typed(keys.lifted(), Lifted, self._on_lifted),
+        ]
+        for each in self.stops.active:
+            self._pursue(each)
+
+    async def close(self) -> None:
+        """Listen no more."""
+        for closer in self._closers:
+            closer.close()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def merge(self, stops: Iterable[SoftStop], lifted: Iterable[Lifted]) -> None:
+        """Take in what another gateway knows; on disk when it returns."""
+        new = [each for each in stops if self.stops.room(each) and self.stops.add(each)]
+        gone = [self.stops.lift(each) for each in lifted]
+        if new or any(gone):
+            await self._keep()
+            for each in new:
+                self._pursue(each)
+            self._changed()
+
+    async def stop(self, ask: StopAsk) -> StopAnswer:
+        """Answer `soft_stop`; RefusedError when as many stops are in force as are kept."""
+        stop = SoftStop(
+            id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
+            robots=ask.robots,
+            by=ask.by,
+            why=ask.why,
+            at_ns=time.time_ns(),
+        )
+        if not self.stops.room(stop):
+            standing = self.stops.whole if not stop.robots else None
+            if standing is None:
+                known = len(self.stops.active)
+                raise RefusedError(f"{known} soft stops are in force already", remedy="`swiftbot resume` lifts them")
+            stop = standing  # The fleet is stopped: its robots are told again.
+        self.stops.add(stop)
+        self._changed()
+        self._plane.session.put(self._plane.keys.soft_stop(stop.id), encode(stop))
+        roster = self._plane.registry.robots
+        names = [each for each, info in roster.items() if info.online and self.stops.holds(stop, each)]
+        telling = tell_to_hold(self._plane.session, names, act=stop.id)
+        _, confirmed, told = await asyncio.gather(self._keep(), self._confirm((stop,), ()), telling)
+        held, problems = told
+        problems |= {each: _ABSENT for each in stop.robots if each not in roster}
+        away = [each for each, info in roster.items() if not info.online and self.stops.holds(stop, each)]
+        problems |= dict.fromkeys(away, _AWAY)
+        log.warning("soft stop", by=stop.by, why=stop.why, robots=list(stop.robots) or "the fleet", held=list(held))
+        self._pursue(stop, held)
+        return StopAnswer(
+            stops=self.stops.active, gateways=confirmed[0], silent=confirmed[1], robots=held, problems=problems
+        )
+
+    async def resume(self, ask: ResumeRobotsAsk, learn: Callable[[], Awaitable[None]]) -> StopAnswer:
+        """Answer `soft_resume`: only what was seen is lifted, by the operator, or here, after `learn` asked the others.
+
+        Repeated under the same act it is done already, whatever was stopped meanwhile.
+        """
+        done = next((each for each in self.stops.lifted if ask.act and each.id == ask.act), None)
+        if done is not None:
+            confirmed, silent = await self._confirm((), (done,))
+            return StopAnswer(stops=self.stops.active, gateways=confirmed, silent=silent)
+        await learn()
+        names = ask.stops or self.stops.to_lift(ask.robots)
+        if not names:
+            return StopAnswer(stops=self.stops.active, gateways=(self._plane.gateway,))
+        lifted = Lifted(
+            id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
+            stops=names,
+            robots=ask.robots,
+            by=ask.by,
+            why=ask.why,
+            at_ns=time.time_ns(),
+        )
+        self.stops.lift(lifted)
+        await self._keep()
+        self._plane.session.put(self._plane.keys.lifted(lifted.id), encode(lifted))
+        self._changed()
+        log.warning("soft stop lifted", by=lifted.by, why=lifted.why, robots=list(lifted.robots) or "all that it held")
+        confirmed, silent = await self._confirm((), (lifted,))
+        return StopAnswer(stops=self.stops.active, gateways=confirmed, silent=silent)
+
+    def _on_stop(self, key: str, stop: SoftStop | None) -> None:
+        if stop is None or stop.id in {each.id for each in self.stops.stops}:
+            return
+        if not key.endswith(f"/{stop.id}") or not self.stops.room(stop):
+            self._plane.session.refuse("misplaced operator/stop/*", key=key, says=stop.id)
+            return
+        self._later(self.merge((stop,), ()))
+
+    def _on_lifted(self, key: str, lifted: Lifted | None) -> None:
+        if lifted is None:
+            return
+        if not key.endswith(f"/{lifted.id}"):
+            self._plane.session.refuse("misplaced operator/resume/*", key=key, says=lifted.id)
+            return
+        self._later(self.merge((), (lifted,)))
+
+    def _pursue(self, stop: SoftStop, held: Iterable[str] = ()) -> None:
+        """Have the robots of a stop hold, once and for as long as it is in force."""
+        if stop.id not in self._held:
+            self._held[stop.id] = set()
+            self._later(self._have_hold(stop))
+        self._held[stop.id].update(held)
+
+    async def _have_hold(self, stop: SoftStop) -> None:
+        """Tell the robots that this gateway answers for until each has said that it holds, and who comes back again."""
+        held = self._held[stop.id]
+        said: dict[str, str] = {}
+        try:
+            for pause_s in itertools.chain(AGAIN_S, itertools.repeat(EVERY_S)):
+                await asyncio.sleep(pause_s)
+                if not self.stops.in_force(stop.id):
+                    return
+                roster = self._plane.registry.robots
+                mine = {
+                    each
+                    for each, info in roster.items()
+                    if info.online and self._mine(each, info.gateway) and self.stops.holds(stop, each)
+                }
+                # One that was away, or with another gateway, may have been told to move there.
+                held &= mine
+                if left := mine - held:
+                    done, problems = await tell_to_hold(self._plane.session, left, act=stop.id)
+                    held.update(done)
+                    for robot, problem in problems.items():
+                        if said.get(robot) != problem:
+                            log.warning("a robot does not confirm that it holds", robot=robot, reason=problem)
+                    said = problems
+        finally:
+            del self._held[stop.id]
+
+    def _mine(self, robot: str, gateway: str) -> bool:
+        return gateway == self._plane.gateway or (not gateway and self._plane.dht.owns(f"robot/{robot}"))
+
+    async def _confirm(
+        self, stops: tuple[SoftStop, ...], lifted: tuple[Lifted, ...]
+    ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Have the other gateways keep something; those that have, and those that did not say so in time."""
+        others = sorted(self._plane.members() - {self._plane.gateway})
+        ask = StandingAsk(stops=stops, lifted=lifted)
+
+        async def tell(member: str) -> bool:
+            try:
+                await self._plane.rpc.call(member, "standing", ask, Standing, timeout_s=CONFIRM_S)
+            except SwiftbotError as error:
+                log.warning("a gateway does not confirm a soft stop", member=member, reason=str(error))
+                return False
+            return True
+
+        said = dict(zip(others, await asyncio.gather(*(tell(each) for each in others)), strict=True))
+        confirmed = tuple(sorted([self._plane.gateway, *(each for each, done in said.items() if done)]))
+        return confirmed, tuple(each for each, done in said.items() if not done)
+
+    async def _keep(self) -> None:
+        async with self._writing:
+            kept = StandingAsk(stops=self.stops.stops, lifted=self.stops.lifted)
+            await self._plane.store.put(STORED, encode(kept))
+
+    def _later(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: "asyncio.Task[Any]") -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.error("what follows from a soft stop broke", exc_info=error)

@@ -1,0 +1,356 @@
+"""What an order may ask of a robot, looked at before it is sent: limits of configuration, robot and site.
+
+A MAVLink vehicle is held to its site last, in the gateway that commands it (`policy`). A robot that speaks Zenoh
+commands itself, and nobody knows whether it looks at anything: so whoever sends it an order on behalf of a task or of
+an operator holds the order to the site, and to what the robot said of itself when it registered. Limits that the
+configuration gives to robots (`[safety] limits`) hold for both kinds. What is above a bound is refused with the reason;
+speeds and take-off heights that nobody asked for, a skill's usual ones, are lowered to it. `Orders` puts the roster in;
+the rest is pure.
+"""
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import structlog
+from msgspec import Struct
+from msgspec.structs import replace
+
+from appliance.errors import SwiftbotError, from_code
+from appliance.model import Box, Pose, RobotCommand, RobotInfo, Site
+from appliance.model.geo import blocked_leg, inside
+from appliance.robots.policy import check_mission, check_orbit, check_points, check_speed
+from appliance.robots.verbs import (
+    GotoArgs,
+    MissionArgs,
+    OrbitArgs,
+    RobotFailure,
+    TakeoffArgs,
+    VelocityArgs,
+    Waypoint,
+    parse_args,
+)
+
+log = structlog.get_logger(__name__)
+
+CHOSEN = frozenset({"speed_mps", "altitude_m"})
+"""Values that a skill chooses where its plan says none."""
+STALE_M = 0.5
+"""A robot's place in the roster is some tenths of a second old: an area that it stands in or at by that place loses so
+much of its rim for the leg that begins there, which the robot itself, knowing better, looks at again."""
+_GROUND_M = 0.5
+_GRAZE_M = 0.05
+"""The edge of an area may be grazed (`geo.crosses`)."""
+_CORE_M = 4 * _GRAZE_M
+"""What is left of the narrowest wall when it loses its rim: enough to be in the way."""
+
+
+class Bounds(Struct, frozen=True, kw_only=True):
+    """The most that somebody allows; None where they say nothing."""
+
+    whose: str
+    """In words, for messages: `the limits that rover_1 registered`."""
+    speed_mps: float | None = None
+    altitude_m: float | None = None
+    range_m: float | None = None
+    """Longest way of one order."""
+
+
+class Usual(Struct, frozen=True, kw_only=True):
+    """What a robot does by itself where an order does not say: how fast it goes, how high from the ground."""
+
+    speed_mps: float = math.inf
+    takeoff_m: float = math.inf
+
+
+class _Bound(Struct, frozen=True):
+    value: float
+    whose: str
+
+
+def registered(info: RobotInfo) -> Bounds:
+    """Return what a robot said of itself."""
+    limits, whose = info.limits, f"the limits that {info.id} registered"
+    if limits is None:
+        return Bounds(whose=whose)
+    altitude = limits.altitude_m if info.flies else None
+    return Bounds(whose=whose, speed_mps=limits.speed_mps, altitude_m=altitude, range_m=limits.range_m)
+
+
+def held(
+    command: RobotCommand,
+    info: RobotInfo | None,
+    bounds: Sequence[Bounds],
+    site: Site | None,
+    *,
+    chosen: Collection[str] = (),
+    usual: "Usual | None" = None,
+    begun: bool = False,
+) -> RobotCommand:
+    """Return an order as it may be sent.
+
+    Args:
+        command: the order.
+        info: its robot as the roster has it; None: it is not there, and only bounds can be looked at.
+        bounds: whose limits hold.
+        site: the site, for robots that nobody else holds to it; None: it is not looked at.
+        chosen: arguments that nobody asked for: they are lowered to a bound instead of refused.
+        usual: what the robot does where an order does not say; None: it is not known.
+        begun: the robot may be carrying it out already. It is somewhere on the way then: the leg and the range from
+            where it is now are not those of the order, and refusing it would leave the robot going unwatched.
+
+    Raises:
+        RobotFailure: `refused` with whose limit it breaks, `payload` when its arguments cannot be read.
+    """
+    kinds: dict[str, type[Struct]] = {
+        "goto": GotoArgs,
+        "mission": MissionArgs,
+        "orbit": OrbitArgs,
+        "takeoff": TakeoffArgs,
+        "velocity": VelocityArgs,
+    }
+    kind = kinds.get(command.verb)
+    if kind is None:
+        return command
+    args = parse_args(command.verb, command.args, kind)
+    usual = usual or Usual()
+    speed, altitude = _strictest(bounds, "speed_mps"), _strictest(bounds, "altitude_m")
+    match args:
+        case VelocityArgs():
+            pace = math.hypot(args.forward_mps, args.left_mps, args.up_mps)
+            _within(pace, speed, "m/s")
+            if site is not None and pace > 0.0:
+                check_speed(site, pace, verb="velocity")
+            return command
+        case TakeoffArgs():
+            height = _climb(args.altitude_m, altitude, usual.takeoff_m, lower="altitude_m" in chosen)
+            if site is not None:
+                _within(height, _Bound(site.altitude_limit_m, "the site's limit"), "m up")
+            return command if height == args.altitude_m else _with(command, altitude_m=height)
+        case GotoArgs() | MissionArgs() | OrbitArgs():
+            way = _way(args)
+            for point in way:
+                _within(point.z, altitude, "m up")
+            _check_range(None if begun else info, way, _strictest(bounds, "range_m"))
+            changed = _from_the_ground(command, info, altitude, usual.takeoff_m)
+            changed = _slowed(changed, args.speed_mps, speed, usual.speed_mps, lower="speed_mps" in chosen)
+            if site is not None:
+                _check_site(site, info, replace(args, speed_mps=changed.args.get("speed_mps")), begun=begun)
+            return changed
+        case _:
+            return command
+
+
+def _strictest(bounds: Sequence[Bounds], key: str) -> _Bound | None:
+    found = [_Bound(value, each.whose) for each in bounds if (value := getattr(each, key)) is not None]
+    return min(found, key=lambda each: each.value, default=None)
+
+
+def _within(value: float | None, bound: _Bound | None, unit: str) -> None:
+    """Raise RobotFailure for what is above a bound; what is no number is not below it."""
+    if value is None or bound is None or value <= bound.value:
+        return
+    raise RobotFailure(
+        "refused",
+        f"{value:g} {unit} is above {bound.value:g} {unit}, by {bound.whose}",
+        remedy=f"ask for at most {bound.value:g} {unit}",
+    )
+
+
+def _slowed(
+    command: RobotCommand, speed: float | None, bound: _Bound | None, usual_mps: float, *, lower: bool
+) -> RobotCommand:
+    """Return an order at a speed within the bound; robots choose their own where none is said."""
+    if bound is None or (speed is None and usual_mps <= bound.value):
+        return command
+    if speed is not None and not lower:
+        _within(speed, bound, "m/s")
+    return command if speed is not None and speed <= bound.value else _with(command, speed_mps=bound.value)
+
+
+def _climb(height: float | None, bound: _Bound | None, usual_m: float, *, lower: bool) -> float | None:
+    if bound is None:
+        return height
+    if height is None:
+        return bound.value if bound.value < usual_m else None
+    if not lower:
+        _within(height, bound, "m up")
+    return min(height, bound.value)
+
+
+def _from_the_ground(
+    command: RobotCommand, info: RobotInfo | None, bound: _Bound | None, usual_m: float
+) -> RobotCommand:
+    """Give the points of a way that begins on the ground a height, where its robot would else go higher than it may."""
+    if bound is None or bound.value >= usual_m or info is None or not info.flies:
+        return command
+    name = "waypoints" if command.verb == "goto" else "steps"
+    points: list[dict[str, Any]] = [command.args] if command.verb == "orbit" else command.args[name]
+    z = None if all(map(_high, points)) else _begun_at(info, bound)
+    if z is None:
+        return command
+    given = [point if _high(point) else {**point, "z": z} for point in points]
+    return _with(command, z=z) if command.verb == "orbit" else _with(command, **{name: given})
+
+
+def _begun_at(info: RobotInfo, bound: _Bound) -> float | None:
+    """Return the height of the site at which a way without heights is begun, None where its robot flies and keeps its.
+
+    Bounds count from the ground that a robot takes off from, its home; heights of the site from the site's origin,
+    which may be up or down the hill.
+    """
+    here = None if info.pose is None else info.pose.z
+    ground = info.home.z if info.home is not None else None if info.armed else here
+    if ground is None:
+        # Armed, and nobody knows above what: a robot that flies keeps its height, one that does not is held to it.
+        return bound.value if here is None or here <= _GROUND_M else min(bound.value, here)
+    if info.armed and here is not None and here - ground > _GROUND_M:
+        return None
+    z = ground + bound.value
+    if z <= _GROUND_M:
+        # So low a height means "as it is" in an order, and it would climb as high as it usually does.
+        raise RobotFailure(
+            "refused",
+            f"{info.id} stands {-ground:.0f} m below the site's origin, where an order cannot hold it to "
+            f"{bound.value:g} m up, by {bound.whose}",
+            remedy="let it take off first: `takeoff` counts from the ground",
+        )
+    return z
+
+
+def _high(point: Mapping[str, Any]) -> bool:
+    """Whether a point has a height of its own: on the ground it means the one that is flown at."""
+    return (point.get("z") or 0.0) > _GROUND_M
+
+
+def _with(command: RobotCommand, **args: object) -> RobotCommand:
+    return replace(command, args=command.args | args)
+
+
+def _way(args: GotoArgs | MissionArgs | OrbitArgs) -> tuple[Waypoint, ...]:
+    match args:
+        case GotoArgs():
+            return args.waypoints
+        case MissionArgs():
+            return tuple(Waypoint(step.x, step.y, step.z) for step in args.steps)
+        case OrbitArgs():
+            return (Waypoint(args.x, args.y, args.z),)
+
+
+def _check_range(info: RobotInfo | None, way: Sequence[Waypoint], bound: _Bound | None) -> None:
+    if bound is None:
+        return
+    places = [(point.x, point.y) for point in way]
+    if info is not None and info.pose is not None:
+        places.insert(0, (info.pose.x, info.pose.y))
+    metres = sum(math.dist(one, other) for one, other in pairwise(places))
+    if not metres <= bound.value:  # what is no number too
+        raise RobotFailure(
+            "refused",
+            f"a way of {metres:.0f} m is longer than {bound.value:g} m, by {bound.whose}",
+            remedy="go in several steps, with a charge between them",
+        )
+
+
+def _check_site(site: Site, info: RobotInfo | None, args: GotoArgs | MissionArgs | OrbitArgs, *, begun: bool) -> None:
+    """Raise RobotFailure for a way that the site does not allow, as far as the roster tells where it begins."""
+    flies = info is not None and info.flies
+    here = None if info is None else info.pose
+    match args:
+        case OrbitArgs():
+            # Begun on the circle: its middle may be in an area, and the way to it is the robot's.
+            check_orbit(site, Pose(x=args.x + args.radius_m, y=args.y), args, flies=flies)
+            return
+        case MissionArgs():
+            check_mission(site, None, args, flies=flies)
+        case GotoArgs():
+            check_points(site, None, args.waypoints, flies=flies)
+            check_speed(site, args.speed_mps)
+    way = _way(args)
+    first = way[0]
+    closed = site.forbidden if flies else (*site.forbidden, *site.obstacles)
+    for box in closed:
+        # Whatever stands in one must be able to leave it, by a point in it too.
+        out = here is not None and inside(box, here.x, here.y, STALE_M)
+        if not out and inside(box, first.x, first.y, -_GRAZE_M):
+            raise RobotFailure("refused", f"waypoint 1 is in {box.name}", remedy="choose a point outside of it")
+    if len(way) > 1:
+        check_points(site, Pose(x=first.x, y=first.y), way[1:], flies=flies, verb=_verb(args), behind=1)
+    if here is None or begun:
+        return
+    # Where it is far from a wall, the age of its place makes none of the wall go away.
+    boxes = [_smaller(box) if inside(box, here.x, here.y, STALE_M) else box for box in closed]
+    blocked = blocked_leg(boxes, (here.x, here.y), [(first.x, first.y)])
+    if blocked is not None:
+        raise RobotFailure(
+            "refused", f"the leg to waypoint 1 goes through {blocked[1].name}", remedy="plan a way round it"
+        )
+
+
+def _verb(args: Struct) -> str:
+    return "goto" if isinstance(args, GotoArgs) else "mission"
+
+
+def _smaller(box: Box) -> Box:
+    """Return a box without its rim; a narrow one keeps its middle, or whoever stands at a wall would see none."""
+
+    def middle(low: float, high: float) -> tuple[float, float]:
+        rim = max(0.0, min(STALE_M, (high - low - _CORE_M) / 2))
+        return low + rim, high - rim
+
+    return Box(name=box.name, x=middle(*box.x), y=middle(*box.y))
+
+
+class Orders:
+    """Holds the orders of one gateway's tasks and operators.
+
+    Args:
+        site: the site.
+        roster: the robots as they are known now.
+        configured: what the configuration gives a robot.
+        vehicles: what vehicles that a gateway commands do by themselves, by whether they fly.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        *,
+        roster: Callable[[], Mapping[str, RobotInfo]],
+        configured: Callable[[str], Bounds],
+        vehicles: Callable[[bool], Usual],
+    ) -> None:
+        self._site = site
+        self._roster = roster
+        self._configured = configured
+        self._vehicles = vehicles
+
+    def held(
+        self, robot: str, command: RobotCommand, chosen: Collection[str] = (), begun: bool = False
+    ) -> RobotCommand:
+        """Return an order as it may be sent; RefusedError with the reason, PayloadError for what cannot be read.
+
+        Arguments as of `held`.
+        """
+        info = self._roster().get(robot)
+        bounds = [self._configured(robot)]
+        alone = info is not None and info.kind == "zenoh"
+        if info is not None and alone:
+            bounds.append(registered(info))
+        try:
+            usual = None if info is None or alone else self._vehicles(info.flies)
+            site = self._site if alone else None
+            sent = held(command, info, bounds, site, chosen=chosen, usual=usual, begun=begun)
+        except RobotFailure as error:
+            failure = error.failure
+            log.warning("order not sent", robot=robot, verb=command.verb, id=command.id, reason=failure.message)
+            raise _told(robot, error) from error
+        if sent is not command:
+            lowered = {key: sent.args[key] for key in CHOSEN if sent.args.get(key) != command.args.get(key)}
+            log.info("order is held to its limits", robot=robot, verb=command.verb, id=command.id, **lowered)
+        return sent
+
+
+def _told(robot: str, error: RobotFailure) -> SwiftbotError:
+    failure = error.failure
+    return from_code(failure.code, f"not sent to {robot}: {failure.message}", failure.remedy)

@@ -1,0 +1,77 @@
+"""What a vehicle says in words: STATUSTEXT, put together from its parts, and which of it explains a refusal.
+
+A text of more than 50 characters comes in parts with a common `id` (MAVLink guide, STATUSTEXT); parts can be lost, so
+what has arrived is told after a while with a mark where something is missing. Pure, the clock passed in.
+"""
+
+from collections import OrderedDict, deque
+
+from msgspec import Struct
+
+PART = 50
+MAX_PARTS = 8
+MAX_OPEN = 8
+KEPT = 32
+WARNING = 4
+"""MAV_SEVERITY_WARNING: what is less urgent explains no refusal, unless it says so itself."""
+_PATIENCE_S = 1.0
+_EXPLAINS = ("prearm:", "arm:", "arming:")
+
+
+class Said(Struct, frozen=True):
+    """A whole text: when it was heard (monotonic seconds), MAV_SEVERITY, words."""
+
+    at: float
+    severity: int
+    text: str
+
+    @property
+    def explains(self) -> bool:
+        """Whether it may tell why something was refused."""
+        return self.severity <= WARNING or self.text.lower().startswith(_EXPLAINS)
+
+
+class Texts:
+    """Texts of one vehicle, the last ones kept."""
+
+    def __init__(self) -> None:
+        self._open: OrderedDict[int, tuple[float, int, dict[int, str]]] = OrderedDict()
+        self._said: deque[Said] = deque(maxlen=KEPT)
+
+    def take(self, severity: int, text: str | bytes, number: int, part: int, now: float) -> Said | None:
+        """Take in a STATUSTEXT; return the text that it completes, if it does."""
+        raw = text if isinstance(text, bytes) else text.encode("utf-8", "replace")
+        words = raw.split(b"\0")[0].decode("utf-8", "replace")
+        if number == 0:
+            return self._keep(Said(now, severity, words.strip()))
+        if not 0 <= part < MAX_PARTS:
+            return None
+        began, _, parts = self._open.setdefault(number, (now, severity, {}))
+        parts[part] = words
+        while len(self._open) > MAX_OPEN:
+            self._close(next(iter(self._open)))
+        # A part that is not full is the last one.
+        last = next((index for index, each in sorted(parts.items()) if len(each.encode()) < PART), None)
+        if (last is not None and len(parts) == last + 1) or len(parts) == MAX_PARTS:
+            return self._close(number)
+        del began
+        return None
+
+    def tick(self, now: float) -> None:
+        """Give up waiting for parts that do not come."""
+        for number in [number for number, (began, _, _) in self._open.items() if now - began > _PATIENCE_S]:
+            self._close(number)
+
+    def since(self, at: float, now: float) -> tuple[str, ...]:
+        """Return the words since a time that may explain a refusal, each once, oldest first."""
+        self.tick(now + _PATIENCE_S)
+        return tuple(dict.fromkeys(each.text for each in self._said if each.at >= at and each.explains and each.text))
+
+    def _close(self, number: int) -> Said:
+        began, severity, parts = self._open.pop(number)
+        words = "".join(parts.get(index, "…") for index in range(max(parts) + 1))
+        return self._keep(Said(began, severity, words.strip()))
+
+    def _keep(self, said: Said) -> Said:
+        self._said.append(said)
+        return said

@@ -1,0 +1,253 @@
+"""What becomes of each good frame on a gateway's links: recorded, taken by the gateway itself, or passed on.
+
+Whose frames are believed, and which senders are vehicles, the station decides; here frames only come in and go out.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+
+from appliance.model import Site, TaskRecord, encode
+from appliance.plane.session import Closer, Session
+from appliance.robots.api import LinkList
+from appliance.robots.doors import Tasks
+from appliance.robots.ledger import KeyValues
+from appliance.robots.mavlink.dialect import Frame, Message, make
+from appliance.robots.mavlink.frames import MARKER_V2
+from appliance.robots.mavlink.letters import LetterDesk
+from appliance.robots.mavlink.links import Address
+from appliance.robots.mavlink.mission_desk import MISSION_MESSAGES, MissionDesk
+from appliance.robots.mavlink.requests import COMMAND_MESSAGES, RequestDesk
+from appliance.robots.mavlink.routing import End, Router
+from appliance.robots.mavlink.table import LinkTable, OpenLink
+from appliance.robots.mavlink.tunnel import PAYLOAD_TYPE
+from appliance.robots.mavlink.vehicle import Vehicle
+from appliance.robots.settings import RobotsConfig
+
+FRAME_ENCODING = "application/mavlink"
+_LINKS_S = 1.0
+"""How often the links are told about."""
+_BUSY = 5000
+"""Messages that wait to be sent by the plane, beyond which streams are not read: what comes in is to be recorded."""
+_ASKING = COMMAND_MESSAGES | MISSION_MESSAGES | {"TUNNEL"}
+"""Messages by which the gateway itself may be asked for something."""
+SETUP_SIGNING = (256).to_bytes(3, "little")
+"""The id of that message, as it stands in a frame."""
+
+
+class Switch:
+    """All links of one gateway, and the ways between them.
+
+    Args:
+        config: the robots room's settings.
+        session: where frames are put, and records of tasks are heard.
+        store: keeps what must outlive a restart.
+        gateway: this one's name.
+        site: where missions are.
+        refused: counters of bad input.
+        tasks: the fleet's tasks; None where this gateway takes none.
+        on_frame: told each good frame that is no repetition, of which link and from which end.
+        on_gone: told each link that was removed.
+        vehicles_of: the vehicles of a system id.
+        names_at: names of the vehicles at an end.
+    """
+
+    def __init__(
+        self,
+        config: RobotsConfig,
+        *,
+        session: Session,
+        store: KeyValues,
+        gateway: str,
+        site: Site,
+        refused: dict[str, int],
+        tasks: Tasks | None,
+        on_frame: Callable[[OpenLink, Frame, End, float], None],
+        on_gone: Callable[[OpenLink], None],
+        vehicles_of: Callable[[int], Sequence[Vehicle]],
+        names_at: Callable[[End], Sequence[str]],
+    ) -> None:
+        self._config = config
+        self._session = session
+        self._gateway = gateway
+        self._refused = refused
+        self._on_frame = on_frame
+        self._vehicles_of = vehicles_of
+        self._names_at = names_at
+        self._loop = asyncio.get_running_loop()
+        self.router = Router(own_system=config.system_id, repeat_s=config.repeat_s)
+        self.links = LinkTable(
+            config,
+            store=store,
+            router=self.router,
+            on_frame=self._receive,
+            on_gone=on_gone,
+            refused=refused,
+            busy=lambda: session.unsent > _BUSY,
+        )
+        self._missions = MissionDesk(config, site=site, store=store, refused=refused, clock=time.monotonic)
+        self._requests = RequestDesk(
+            config.templates, tasks=tasks, store=store, refused=refused, mission=self._missions.request
+        )
+        self._letters = LetterDesk(tasks=tasks, refused=refused, clock=time.monotonic)
+        self._records: Closer | None = None
+        self._tell_at = 0.0
+
+    async def open(self) -> None:
+        """Open the links and begin; ConfigError with the remedy when a setting is wrong or a port taken."""
+        await self._missions.load()
+        await self._requests.load()
+        self._records = self._session.subscribe_typed(
+            self._session.keys.task(), TaskRecord, self._on_record, wanted=self._follows
+        )
+        await self.links.open()
+
+    async def quiet(self) -> None:
+        """Take nothing more from anybody; what was under way is asked again by whoever wanted it."""
+        await self._requests.close()
+        await self._letters.close()
+        await self._missions.close()
+        if self._records is not None:
+            self._records.close()
+            self._records = None
+
+    # --- in ----------------------------------------------------------------------------------------------------
+
+    def _receive(self, entry: OpenLink, frame: Frame, address: Address) -> None:
+        now = self._loop.time()
+        source = (frame.system, frame.component)
+        sender = entry.link.stats.sender(*source)
+        if self.router.repeated(frame.raw, now, sender=source):
+            sender.repeated += 1
+            self._refused["repeated"] = self._refused.get("repeated", 0) + 1
+            return
+        sender.hear(frame.sequence, now)
+        self._on_frame(entry, frame, entry.end(address), now)
+
+    def hand_on(self, entry: OpenLink, frame: Frame, source: End, sender: Vehicle | None, now: float) -> None:
+        """Take what is for the gateway, pass on the rest. `sender`: the vehicle whose system's frame it is."""
+        if self._ask(frame, source, sender):
+            return
+        if frame.name == "TIMESYNC":
+            if self.links.timed(entry, frame, source.address):
+                return
+            self._tell_time(entry, frame, source, sender)
+        if not self._config.route:
+            return
+        self.router.hear(frame, source, now)
+        for end in self.router.destinations(frame, source):
+            other = self.links.get(end.link)
+            if other is not None:
+                raw = other.link.codec.pass_on(frame)
+                other.link.transmit(raw, end.address)
+                for name in self._names_at(end) or ("",):
+                    self.record(end, name, "tx", raw)
+
+    def _ask(self, frame: Frame, source: End, sender: Vehicle | None) -> bool:
+        """Take what is for the gateway as an onboard computer: of its own system, or of a vehicle's.
+
+        Ground stations know vehicles, not gateways: their buttons address component 191 of the vehicle's system. Where
+        a real companion computer has that number, the command is its.
+        """
+        if frame.target_component != self._config.component_id or frame.name not in _ASKING:
+            return False
+        if frame.name == "TUNNEL" and frame.message.payload_type != PAYLOAD_TYPE:
+            return False
+        mission = frame.name in MISSION_MESSAGES
+        if mission and sender is not None and frame.component == sender.component:
+            return False  # an autopilot's answer while a mission is uploaded to it
+        system = frame.target_system
+        robot = asker = "" if sender is None else sender.name
+        if system != self._config.system_id:
+            addressed = self._vehicles_of(system)
+            if len(addressed) != 1 or self.router.knows(system, self._config.component_id):
+                return False
+            robot = addressed[0].name
+
+        def reply(message: Message) -> None:
+            entry = self.links.get(source.link)
+            if entry is not None:
+                raw = entry.link.send(message, source.address, system=system)
+                self.record(source, "" if sender is None else sender.name, "tx", raw)
+
+        if mission:
+            self._missions.take(frame, robot=robot, reply=reply)
+        elif frame.name == "TUNNEL":
+            self._letters.take(frame, asker=asker, reply=reply)
+        else:
+            self._requests.take(frame, robot=robot, asker=asker, reply=reply)
+        return True
+
+    def _tell_time(self, entry: OpenLink, frame: Frame, source: End, sender: Vehicle | None) -> None:
+        """Answer a question for the time with this gateway's own, the one that its questions carry.
+
+        MAVLink guide, "Time Synchronization Protocol": a question has `tc1` 0; the answer has the time of whoever
+        answers in it, and the asker's own `ts1`. A dialect that addresses it may mean somebody else.
+        """
+        message = frame.message
+        if message.tc1 != 0 or frame.target_system not in (0, self._config.system_id):
+            return
+        raw = entry.link.send(make("TIMESYNC", tc1=time.monotonic_ns(), ts1=message.ts1), source.address)
+        self.record(source, "" if sender is None else sender.name, "tx", raw)
+
+    # --- out ---------------------------------------------------------------------------------------------------
+
+    def record(self, end: End, vehicle: str, direction: str, raw: bytes) -> None:
+        """Put a frame on the plane, for the recorder: by its vehicle's name, or its link's number where it has none.
+
+        One that sets a vehicle's signing key is routed and not told: the key is in it (MAVLink, SETUP_SIGNING).
+        """
+        if raw[0] == MARKER_V2 and raw[7:10] == SETUP_SIGNING:
+            return
+        keys = self._session.keys
+        key = keys.mavlink(vehicle, direction) if vehicle else keys.link_frames(self._gateway, str(end.link), direction)
+        self._session.put(key, raw, encoding=FRAME_ENCODING)
+
+    def send(self, end: End, vehicle: str, message: Message) -> None:
+        """Send the gateway's own message to a vehicle."""
+        entry = self.links.get(end.link)
+        if entry is not None:
+            self.record(end, vehicle, "tx", entry.link.send(message, end.address))
+
+    def greet(self, message: Message, reached: set[End]) -> None:
+        """Send a heartbeat to all other ends that are known before they were heard, so that they know us."""
+        for entry in self.links:
+            for other in entry.link.others:
+                end = entry.end(other)
+                if end not in reached:
+                    self.record(end, "", "tx", entry.link.send(message, other))
+
+    def announce(self, message: Message, vehicles: set[End]) -> None:
+        """Send a message to all ends that have been heard, but those of vehicles: ground stations, other routers."""
+        for end in self.router.ends:
+            if end not in vehicles:
+                self.send(end, "", message)
+
+    def link_list(self) -> LinkList:
+        """All links, what went over them, and where each sender is."""
+        return LinkList(gateway=self._gateway, links=self.links.all_facts(), routes=self.links.routes())
+
+    def ask_time(self, ends: set[End]) -> None:
+        """Ask ends for their time, which tells the latency."""
+        for end, raw in self.links.ask_time(ends):
+            for name in self._names_at(end) or ("",):
+                self.record(end, name, "tx", raw)
+
+    def tick(self, now: float) -> None:
+        """Send what is due; to be called some twenty times a second."""
+        if now >= self._tell_at:
+            self._tell_at = now + _LINKS_S
+            self._session.put(self._session.keys.links(self._gateway), encode(self.link_list()))
+        self._letters.tick()
+        self._missions.tick()
+
+    def _follows(self, key: str) -> bool:
+        """Whether anybody here is told of a record: most are of other gateways' business, and large."""
+        task = key.split("/")[-2]
+        return self._requests.follows(task) or self._letters.follows(task)
+
+    def _on_record(self, key: str, record: TaskRecord | None) -> None:
+        del key
+        if record is not None:
+            self._requests.news(record)
+            self._letters.news(record)

@@ -1,0 +1,348 @@
+"""The links of one gateway: opened by the configuration, added and removed at run time, kept, counted.
+
+What an operator adds or removes is written to the gateway's store before it is answered, so that a restart finds the
+same links: those of the configuration without the removed ones, and those added. Each link has a number, by which
+routing and signatures know it.
+"""
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+import structlog
+from msgspec import Struct
+
+from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
+from appliance.model import encode
+from appliance.robots.api import LatencyFacts, LinkFacts, SenderFacts
+from appliance.robots.hub import ADDED_LINKS as KEY
+from appliance.robots.ledger import KeyValues
+from appliance.robots.mavlink.dialect import Codec, Frame, make
+from appliance.robots.mavlink.keeping import load_signer, remember
+from appliance.robots.mavlink.kinds import KINDS, NAMES
+from appliance.robots.mavlink.links import Address, Link, open_link
+from appliance.robots.mavlink.routing import End, Router, Rules
+from appliance.robots.settings import MavlinkLink, RobotsConfig
+
+log = structlog.get_logger(__name__)
+
+MAX_LINKS = 64
+MOST_TOLD = 64
+"""Senders of a link that are told about: those heard last."""
+
+
+class KeptLinks(Struct, frozen=True, kw_only=True):
+    """What operators have changed of the configuration's links."""
+
+    added: tuple[MavlinkLink, ...] = ()
+    removed: tuple[str, ...] = ()
+
+
+class OpenLink(Struct, eq=False):
+    """One link in use."""
+
+    number: int
+    setting: MavlinkLink
+    link: Link
+    added: bool
+    ends: dict[Address, End] = msgspec.field(default_factory=dict[Address, End])
+    """Ends by address, so that none is made anew for each frame."""
+
+    def end(self, address: Address) -> End:
+        """Return the end at an address."""
+        found = self.ends.get(address)
+        if found is None:
+            if len(self.ends) > 4096:
+                self.ends.clear()
+            found = self.ends[address] = End(self.number, address)
+        return found
+
+
+async def kept_links(store: KeyValues) -> KeptLinks:
+    """Return what operators have changed; nothing when that cannot be read, which is logged."""
+    kept = dict(await store.scan(KEY)).get(KEY)
+    try:
+        return msgspec.json.decode(kept, type=KeptLinks) if kept else KeptLinks()
+    except msgspec.DecodeError as error:
+        log.warning("links added at run time cannot be read and are lost", reason=str(error))
+        return KeptLinks()
+
+
+def rules_of(setting: MavlinkLink) -> Rules:
+    """Return a link's filters, by names; ConfigError for a message that is none."""
+
+    def names(wanted: tuple[str, ...]) -> frozenset[str]:
+        found: set[str] = set()
+        for each in wanted:
+            kind = KINDS.get(int(each)) if each.isascii() and each.isdecimal() else None
+            name = kind.name if kind is not None else each.upper()
+            if name not in NAMES:
+                raise ConfigError(
+                    f"robots.mavlink {setting.remote}: {each[:60]!r} is no MAVLink message",
+                    remedy="use names as on mavlink.io (ATTITUDE), or numbers",
+                )
+            found.add(name)
+        return frozenset(found)
+
+    return Rules(
+        only_in=names(setting.only_in),
+        not_in=names(setting.not_in),
+        only_out=names(setting.only_out),
+        not_out=names(setting.not_out),
+    )
+
+
+class LinkTable:
+    """All links.
+
+    Args:
+        config: the links to begin with, and limits.
+        store: keeps what is changed, and what signed links know.
+        router: told which links there are.
+        on_frame: told each good frame, of which link and whose, on the event loop.
+        on_gone: told each link that is removed, once it is closed.
+        refused: counters of bad input by kind.
+        busy: whether no more can be taken just now.
+    """
+
+    def __init__(
+        self,
+        config: RobotsConfig,
+        *,
+        store: KeyValues,
+        router: Router,
+        on_frame: Callable[[OpenLink, Frame, Address], None],
+        on_gone: Callable[[OpenLink], None],
+        refused: dict[str, int],
+        busy: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._config = config
+        self._store = store
+        self._router = router
+        self._on_frame = on_frame
+        self._on_gone = on_gone
+        self._refused = refused
+        self._busy = busy
+        self._links: dict[int, OpenLink] = {}
+        self._kept = KeptLinks()
+        self._changing = asyncio.Lock()
+
+    def __iter__(self) -> Iterator[OpenLink]:
+        return iter(tuple(self._links.values()))
+
+    def __len__(self) -> int:
+        return len(self._links)
+
+    def get(self, number: int) -> OpenLink | None:
+        """Return a link by its number, None when it is closed."""
+        return self._links.get(number)
+
+    async def open(self) -> None:
+        """Open all; ConfigError with the remedy when a setting of the configuration is wrong or its port taken.
+
+        One added at run time that cannot be opened is logged and left out until the next start: the gateway must come
+        up without a person.
+        """
+        self._kept = await kept_links(self._store)
+        for setting in self._config.mavlink:
+            if str(setting.remote) in self._kept.removed:
+                log.info("MAVLink link of the configuration was removed", link=str(setting.remote))
+                continue
+            await self._open(setting, added=False)
+        for setting in self._kept.added:
+            try:
+                setting.check()
+                if self._find(str(setting.remote)) is None:
+                    await self._open(setting, added=True)
+            except SwiftbotError as error:
+                log.warning("a MAVLink link added at run time cannot be opened", reason=str(error))
+
+    async def _open(self, setting: MavlinkLink, *, added: bool) -> OpenLink:
+        rules = rules_of(setting)
+        number = next(each for each in range(MAX_LINKS + 1) if each not in self._links)
+        signer = await load_signer(setting, number, self._store)
+        codec = Codec(self._config.system_id, self._config.component_id, signer=signer)
+
+        def receive(frame: Frame, address: Address) -> None:
+            entry = self._links.get(number)
+            if entry is not None:
+                self._on_frame(entry, frame, address)
+
+        self._router.add(number, rules)
+        try:
+            limit_hz, busy = self._config.sender_hz, self._busy
+            link = await open_link(setting.remote, codec, receive, self._refused, limit_hz=limit_hz, busy=busy)
+        except BaseException:
+            self._router.remove(number)
+            raise
+        entry = self._links[number] = OpenLink(number, setting, link, added)
+        log.info("MAVLink link open", link=str(setting.remote), listens=setting.remote.listens, signed=bool(signer))
+        return entry
+
+    async def close(self) -> None:
+        """Close all and keep what they know."""
+        for each in self:
+            await each.link.close()
+        await remember(((each.setting, each.link) for each in self), self._store, last=True)
+        self._links.clear()
+
+    # --- at run time -------------------------------------------------------------------------------------------
+
+    async def add(self, setting: MavlinkLink, *, by: str) -> LinkFacts:
+        """Open a link and keep it over restarts.
+
+        Raises:
+            ConfigError: it cannot be, or its port is taken.
+            RefusedError: the address is in use by a link with other settings, or there are too many.
+        """
+        setting.check()
+        async with self._changing:
+            url = str(setting.remote)
+            found = self._find(url)
+            if found is None:
+                if len(self._links) >= MAX_LINKS:
+                    raise RefusedError(f"there are {MAX_LINKS} MAVLink links", remedy="remove one that is not needed")
+                found = await self._open(setting, added=not self._configured(setting))
+            elif found.setting != setting:
+                raise RefusedError(f"{url} is a link with other settings", remedy="remove it first")
+            others = tuple(each for each in self._kept.added if str(each.remote) != url)
+            await self._keep(
+                KeptLinks(
+                    added=(*others, setting) if found.added else others,
+                    removed=tuple(each for each in self._kept.removed if each != url),
+                )
+            )
+            log.info("MAVLink link added", link=url, by=by[:120])
+            return self.facts(found, self._now())
+
+    async def remove(self, url: str, *, by: str) -> LinkFacts:
+        """Close a link for good; NotFoundError when there is none of that name."""
+        async with self._changing:
+            found = self._find(url)
+            if found is None:
+                known = ", ".join(str(each.setting.remote) for each in self) or "none"
+                raise NotFoundError(f"no MAVLink link {url[:120]!r}", remedy=f"there are: {known}")
+            last = self.facts(found, self._now())
+            url = str(found.setting.remote)
+            configured = any(str(each.remote) == url for each in self._config.mavlink)
+            await self._keep(
+                KeptLinks(
+                    added=tuple(each for each in self._kept.added if str(each.remote) != url),
+                    removed=(*self._kept.removed, url) if configured else self._kept.removed,
+                )
+            )
+            await found.link.close()
+            await remember([(found.setting, found.link)], self._store, last=True)
+            del self._links[found.number]
+            self._router.remove(found.number)
+            self._on_gone(found)
+            log.info("MAVLink link removed", link=url, by=by[:120])
+            return last
+
+    async def _keep(self, kept: KeptLinks) -> None:
+        await self._store.put(KEY, encode(kept))
+        self._kept = kept
+
+    def _configured(self, setting: MavlinkLink) -> bool:
+        return setting in self._config.mavlink
+
+    def _find(self, url: str) -> OpenLink | None:
+        wanted = url.removesuffix("/")
+        return next((each for each in self if str(each.setting.remote) == wanted), None)
+
+    async def remember(self) -> None:
+        """Keep what signed links know."""
+        await remember(((each.setting, each.link) for each in self), self._store)
+
+    # --- what is told ------------------------------------------------------------------------------------------
+
+    def ask_time(self, ends: set[End]) -> list[tuple[End, bytes]]:
+        """Send each end a TIMESYNC, whose answer tells the latency; returns what was sent."""
+        sent: list[tuple[End, bytes]] = []
+        for end in ends:
+            entry = self._links.get(end.link)
+            if entry is not None:
+                stamp = time.monotonic_ns()
+                entry.link.stats.asked(end.address, stamp, stamp)
+                sent.append((end, entry.link.send(make("TIMESYNC", tc1=0, ts1=stamp), end.address)))
+        return sent
+
+    @staticmethod
+    def timed(entry: OpenLink, frame: Frame, address: Address) -> bool:
+        """Take the answer to a TIMESYNC of ours; whether it was one."""
+        if frame.message.tc1 == 0:
+            return False
+        return entry.link.stats.answered(address, frame.message.ts1, time.monotonic_ns())
+
+    def all_facts(self) -> tuple[LinkFacts, ...]:
+        """All links as they are now."""
+        now = self._now()
+        return tuple(self.facts(each, now) for each in self)
+
+    def facts(self, entry: OpenLink, now: float) -> LinkFacts:
+        """One link as it is now."""
+        stats, link = entry.link.stats, entry.link
+        stats.look(now)
+        in_hz, in_bytes_s, out_hz, out_bytes_s = stats.meter.rates
+        heard = sorted(stats.senders.items(), key=lambda each: -each[1].heard_at)[:MOST_TOLD]
+        return LinkFacts(
+            number=entry.number,
+            url=str(entry.setting.remote),
+            listens=entry.setting.remote.listens,
+            signed=link.codec.signer is not None,
+            added=entry.added,
+            ends=tuple(sorted(_shown(end.address) for end in self._router.ends if end.link == entry.number)),
+            frames_in=stats.frames_in,
+            frames_out=stats.frames_out,
+            bytes_in=stats.bytes_in,
+            bytes_out=stats.bytes_out,
+            in_hz=in_hz,
+            out_hz=out_hz,
+            in_bytes_s=in_bytes_s,
+            out_bytes_s=out_bytes_s,
+            refused=dict(link.damaged),
+            senders=tuple(
+                SenderFacts(
+                    system=system,
+                    component=component,
+                    received=each.received,
+                    lost=each.lost,
+                    loss=round(each.loss, 4),
+                    late=each.late,
+                    repeated=each.repeated,
+                    silent_s=round(max(0.0, now - each.heard_at), 1),
+                )
+                for (system, component), each in sorted(heard)
+            ),
+            latency=tuple(
+                LatencyFacts(
+                    end=_shown(address),
+                    last_ms=round(each.last_ms, 3),
+                    least_ms=round(each.least_ms, 3),
+                    mean_ms=round(each.mean_ms, 3),
+                    count=each.count,
+                )
+                for address, each in stats.latency.items()
+                if math.isfinite(each.last_ms)
+            ),
+            problem=link.problem,
+        )
+
+    def routes(self) -> dict[str, str]:
+        """Where each sender was heard last."""
+        found: dict[str, str] = {}
+        for (system, component), end in sorted(self._router.routes.items()):
+            entry = self._links.get(end.link)
+            if entry is not None:
+                found[f"{system}/{component}"] = f"{entry.setting.remote} {_shown(end.address)}"
+        return found
+
+    @staticmethod
+    def _now() -> float:
+        return asyncio.get_running_loop().time()
+
+
+def _shown(address: Address) -> str:
+    return f"{address[0]}:{address[1]}" if address[1] else address[0]
