@@ -25,7 +25,7 @@ demo: setup ## Start a fleet, run instructions on it, replay its log
 	$(RUN) swiftbot demo $${ASK:+"--ask=$$ASK"} $(TUI_FLAG)
 
 test: ## Set up and run everything: lint, types, import contracts, unit, integration and replay tests
-	scripts/setup.sh dev
+	scripts/setup.sh dev --with-browser
 	$(MAKE) --no-print-directory lint formatted types contracts READY=1
 	$(PYTEST) tests
 
@@ -63,9 +63,10 @@ lock: ready ## Pin the dependencies anew in locks/ (UPGRADE=1: newest versions)
 	. scripts/common.sh && export UV_SYSTEM_CERTS=1 && compile() { \
 	  "$$TOOLS/bin/uv" pip compile --quiet --python /usr/bin/python3 --generate-hashes --no-emit-index-url --no-header --no-annotate $(if $(UPGRADE),--upgrade) "$$@"; }; \
 	compile pyproject.toml -o locks/gateway.txt && \
-	compile pyproject.toml --group dev -c locks/gateway.txt -o locks/dev.txt && \
+	compile pyproject.toml --group dev -c locks/gateway.txt --override locks/without.in -o locks/dev.txt && \
 	compile locks/tools.in -o locks/tools.txt && \
 	compile pyproject.toml --extra train -c locks/gateway.txt -o locks/train.txt && \
+	compile pyproject.toml --extra foxglove -c locks/gateway.txt -o locks/foxglove.txt && \
 	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' \
 	  | compile - -o locks/bench.txt
 

@@ -5,19 +5,15 @@ It sits anywhere on the Zenoh network, asks any gateway, and knows nothing of a 
 
 import asyncio
 import contextlib
-import time
 import uuid
 from collections.abc import AsyncGenerator
-from types import TracebackType
-from typing import Self, TypeVar
 
-from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, NotFoundError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import Notice, RunEvent, TaskRecord, TaskRequest, TaskState
-from appliance.plane.node import PlaneClient
-from appliance.plane.settings import PlaneConfig
+from appliance.connection import Endpoint
+from appliance.errors import DeadlineError, RefusedError, SwiftbotError
+from appliance.model import Notice, RunEvent, Site, TaskRecord, TaskRequest, TaskState
+from appliance.plane.once import Once
 from appliance.pool.api import (
     DecisionList,
     DecisionsAsk,
@@ -29,7 +25,20 @@ from appliance.pool.api import (
     Warmed,
 )
 from appliance.pool.transfer.api import Brought, FetchAsk
-from appliance.tasks.api import AgreeAsk, PlanAnswer, PlanAsk, TaskAsk, TaskList, TasksAsk, WhyAsk
+from appliance.robots.api import LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk
+from appliance.steering import SteeringCalls
+from appliance.tasks.api import (
+    AgreeAsk,
+    ExperienceAsk,
+    ExperienceList,
+    PlanAnswer,
+    PlanAsk,
+    SiteAsk,
+    TaskAsk,
+    TaskList,
+    TasksAsk,
+    WhyAsk,
+)
 from appliance.tasks.migration.api import (
     DrainAsk,
     DrainState,
@@ -38,23 +47,14 @@ from appliance.tasks.migration.api import (
     Migrated,
     MoveAsk,
     MoveCancelled,
+    UndrainAsk,
 )
 from appliance.tasks.migration.moving import MOVE_S
 from appliance.tasks.watch.lines import Line
 from appliance.tasks.watch.stream import Stream
 from appliance.tasks.why import TaskWhy
 
-R = TypeVar("R", bound=Struct)
-
-PATIENCE_S = 6.0
-"""How long another gateway is looked for when the one that was asked is gone: detection takes a second."""
-
-
-class Endpoint(Struct, frozen=True, kw_only=True):
-    """Where a fleet is: its name, and endpoints of gateways or routers (`tcp/host:port`)."""
-
-    fleet: str
-    connect: tuple[str, ...]
+__all__ = ["Endpoint", "FleetClient"]
 
 
 def _news(last: TaskRecord, record: TaskRecord) -> bool:
@@ -69,66 +69,21 @@ def _news(last: TaskRecord, record: TaskRecord) -> bool:
     return record.sequence > last.sequence or record.updated_ns > last.updated_ns
 
 
-class FleetClient:
-    """A connection to a fleet; use it as an async context manager."""
+class FleetClient(SteeringCalls):
+    """All that can be asked of a fleet; use it as an async context manager."""
 
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.endpoint = endpoint
-        self._plane: PlaneClient | None = None
+    async def plan(self, instruction: str, *, private: bool = False) -> PlanAnswer:
+        """Decompose, run nothing; `private`: ask no other machine."""
+        asked = PlanAsk(instruction=instruction, private=private)
+        return await self._ask("plan", asked, PlanAnswer, timeout_s=60.0)
 
-    async def open(self) -> Self:
-        """Connect, unless that was done; UnreachableError when nothing answers."""
-        if self._plane is not None:
-            return self
-        self._plane = await PlaneClient.open(
-            PlaneConfig(mode="client", connect=self.endpoint.connect), fleet=self.endpoint.fleet
-        )
-        return self
-
-    async def __aenter__(self) -> Self:
-        return await self.open()
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._plane is not None:
-            await self._plane.close()
-            self._plane = None
-
-    @property
-    def plane(self) -> PlaneClient:
-        """The open connection."""
-        if self._plane is None:
-            raise UnreachableError("the connection to the fleet is not open")
-        return self._plane
-
-    async def gateway(self) -> str:
-        """Any gateway that is present; UnreachableError when there is none."""
-        return await self.plane.any_gateway()
-
-    async def _ask(
-        self, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0, patience_s: float = PATIENCE_S
-    ) -> R:
-        """Ask any gateway, and another one when it is gone or silent: every verb used here may be repeated."""
-        give_up = time.monotonic() + patience_s
-        silent: set[str] = set()
-        while True:
-            gateway = await self.plane.any_gateway(avoid=silent)
-            try:
-                return await self.plane.rpc.call(gateway, verb, request, reply, timeout_s=timeout_s)
-            except UnreachableError:
-                if time.monotonic() > give_up:
-                    raise
-                await asyncio.sleep(0.1)
-            except DeadlineError:
-                # It may be frozen, which is only noticed when its lease ends.
-                silent.add(gateway)
-                if time.monotonic() > give_up or silent >= self.plane.members():
-                    raise
-
-    async def plan(self, instruction: str) -> PlanAnswer:
-        """Decompose, run nothing."""
-        return await self._ask("plan", PlanAsk(instruction=instruction), PlanAnswer, timeout_s=60.0)
+    async def experience(self, limit: int, gateway: str = "") -> ExperienceList:
+        """How skills have done on robots lately, by what a gateway has heard; any gateway's by default."""
+        asked = ExperienceAsk(limit=limit)
+        if not gateway:
+            return await self._ask("experience", asked, ExperienceList)
+        await self._known(gateway)
+        return await self.plane.rpc.call(gateway, "experience", asked, ExperienceList)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
         """Hand in a task; durable when this returns. It gets its id here, so that asking twice is one task."""
@@ -148,13 +103,13 @@ class FleetClient:
         """Say yes or no to the plan that is proposed for a task after a failure."""
         return await self._ask("agree", AgreeAsk(id=task, agree=agree, by=by), TaskRecord)
 
+    async def site(self) -> Site:
+        """The map by which any one gateway understands names of places."""
+        return await self._ask("site", SiteAsk(), Site)
+
     async def why(self, task: str, subtask: str = "") -> TaskWhy:
         """Why a task waits, or was served where it was; NotFoundError when there is no such task or subtask."""
         return await self._ask("why", WhyAsk(id=task, subtask=subtask), TaskWhy)
-
-    async def cancel(self, task: str) -> TaskRecord:
-        """Stop a task."""
-        return await self._ask("cancel", TaskAsk(id=task), TaskRecord)
 
     # --- moving runs --------------------------------------------------------------------------------------------
 
@@ -165,33 +120,59 @@ class FleetClient:
             NotFoundError, RefusedError: it cannot be moved, with the reason; it goes on where it is.
             CancelledByOperatorError: somebody called it off.
         """
-        return await self.plane.rpc.call(await self.gateway(), "migrate", ask, Migrated, timeout_s=MOVE_S)
+        signed = replace(ask, by=ask.by or self.operator)
+        return await self.plane.rpc.call(await self.gateway(), "migrate", signed, Migrated, timeout_s=MOVE_S)
 
     async def migrate_cancel(self, task: str, subtask: str) -> bool:
         """Call off a move that is under way; False when it is too late, or there is none."""
         ask = MoveAsk(task=task, subtask=subtask)
         return (await self._ask("migrate_cancel", ask, MoveCancelled)).cancelled
 
-    async def drain(self, gateway: str, deadline_s: float) -> DrainState:
+    async def drain(self, gateway: str, deadline_s: float, *, why: str = "") -> DrainState:
         """Have a gateway give all its runs away and take no more; returns at once."""
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "drain", DrainAsk(deadline_s=deadline_s), DrainState)
+        return await self.plane.rpc.call(
+            gateway, "drain", DrainAsk(deadline_s=deadline_s, **self._sign(why)), DrainState
+        )
 
-    async def undrain(self, gateway: str) -> DrainState:
+    async def undrain(self, gateway: str, *, why: str = "") -> DrainState:
         """Have a gateway take runs again."""
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "undrain", DrainStateAsk(), DrainState)
+        return await self.plane.rpc.call(gateway, "undrain", UndrainAsk(**self._sign(why)), DrainState)
 
     async def drain_state(self, gateway: str) -> DrainState:
         """How far a gateway is with giving its runs away."""
         return await self.plane.rpc.call(gateway, "drain_state", DrainStateAsk(), DrainState)
+
+    # --- MAVLink links -----------------------------------------------------------------------------------------
+
+    async def robot_links(self, gateway: str = "") -> tuple[dict[str, LinkList], dict[str, SwiftbotError]]:
+        """The MAVLink links of all gateways, or one; and why the others did not tell."""
+        await self._known(gateway)
+        return await self._each(gateway, "robot_links", LinksAsk(), LinkList)
+
+    async def robot_link_add(self, gateway: str, ask: LinkAdd) -> LinkFacts:
+        """Have a gateway open a MAVLink link and keep it over restarts.
+
+        Raises:
+            ConfigError: it cannot be, or its port is taken.
+            RefusedError: there is such a link with other settings.
+        """
+        await self._known(gateway)
+        return await self.plane.rpc.call(gateway, "robot_link_add", ask, LinkFacts)
+
+    async def robot_link_remove(self, gateway: str, ask: LinkRemove) -> LinkFacts:
+        """Have a gateway close a MAVLink link for good; NotFoundError when it has none of that name."""
+        await self._known(gateway)
+        return await self.plane.rpc.call(gateway, "robot_link_remove", ask, LinkFacts, timeout_s=15.0)
 
     # --- pools ------------------------------------------------------------------------------------------------
 
     async def pool_warm(self, gateway: str, ask: WarmAsk) -> Warmed:
         """Have a gateway keep containers of an image ready."""
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "pool_warm", ask, Warmed, timeout_s=ask.wait_s + 5.0)
+        signed = replace(ask, by=ask.by or self.operator)
+        return await self.plane.rpc.call(gateway, "pool_warm", signed, Warmed, timeout_s=ask.wait_s + 5.0)
 
     async def image_fetch(self, gateway: str, reference: str, source: str = "", *, timeout_s: float = 900.0) -> Brought:
         """Have a gateway bring an image to itself, from `source` first; returns when it is there.
@@ -208,7 +189,7 @@ class FleetClient:
         known = self.plane.registry.gateways
         return tuple(sorted(each for each, status in known.items() if reference in status.images))
 
-    async def pool_evict(self, name: str, gateway: str = "") -> dict[str, Evicted]:
+    async def pool_evict(self, name: str, gateway: str = "", *, why: str = "") -> dict[str, Evicted]:
         """Give up a container, by its id or the beginning of it, or all idle ones of an image; answers by gateway.
 
         Raises:
@@ -227,13 +208,14 @@ class FleetClient:
             raise RefusedError(f"several containers begin with {name}: {ids}", remedy="write more of it")
         if held:
             where, container = min(held, key=lambda each: (each[1] != name, each))
-            ask = EvictAsk(container=container)
+            ask = EvictAsk(container=container, **self._sign(why))
             return {where: await self.plane.rpc.call(where, "pool_evict", ask, Evicted)}
-        return await self._all_of(gateway, "pool_evict", EvictAsk(image=name), Evicted)
+        return await self._all_of(gateway, "pool_evict", EvictAsk(image=name, **self._sign(why)), Evicted)
 
-    async def pool_release(self, image: str, gateway: str = "") -> dict[str, Released]:
+    async def pool_release(self, image: str, gateway: str = "", *, why: str = "") -> dict[str, Released]:
         """Have an image started again that is in quarantine, on one gateway or wherever it is."""
-        return await self._all_of(gateway, "pool_release_quarantine", ReleaseAsk(image=image), Released)
+        ask = ReleaseAsk(image=image, **self._sign(why))
+        return await self._all_of(gateway, "pool_release_quarantine", ask, Released)
 
     async def pool_decisions(
         self, limit: int, gateway: str = ""
@@ -241,38 +223,6 @@ class FleetClient:
         """What pools started and gave up lately, by gateway; and why the others did not tell."""
         await self._known(gateway)
         return await self._each(gateway, "pool_decisions", DecisionsAsk(limit=limit), DecisionList)
-
-    async def _known(self, gateway: str) -> None:
-        """Raise when there is no such gateway, or none at all."""
-        await self.gateway()
-        if gateway and gateway not in self.plane.members():
-            known = ", ".join(sorted(self.plane.members()))
-            raise NotFoundError(f"no gateway {gateway[:60]!r} is there", remedy=f"there are: {known}")
-
-    async def _each(
-        self, gateway: str, verb: str, request: Struct, reply: type[R]
-    ) -> tuple[dict[str, R], dict[str, SwiftbotError]]:
-        """Ask one gateway, or all; what they answered, and why some did not."""
-        names = [gateway] if gateway else sorted(self.plane.members())
-        calls = (self.plane.rpc.call(name, verb, request, reply) for name in names)
-        found: dict[str, R] = {}
-        failed: dict[str, SwiftbotError] = {}
-        for name, answer in zip(names, await asyncio.gather(*calls, return_exceptions=True), strict=True):
-            if isinstance(answer, SwiftbotError):
-                failed[name] = answer
-            elif isinstance(answer, BaseException):
-                raise answer
-            else:
-                found[name] = answer
-        return found, failed
-
-    async def _all_of(self, gateway: str, verb: str, request: Struct, reply: type[R]) -> dict[str, R]:
-        """The same, but when none did what was asked, the reason of the first is raised."""
-        await self._known(gateway)
-        found, failed = await self._each(gateway, verb, request, reply)
-        if not found:
-            raise failed[min(failed)]
-        return found
 
     # --- watching ---------------------------------------------------------------------------------------------
 
@@ -348,10 +298,14 @@ class FleetClient:
             ) from None
 
     def on_notice(self, take: "asyncio.Queue[Notice]") -> None:
-        """Have notices to people put into a queue."""
-        self.plane.session.subscribe_typed(
-            self.plane.keys.notice(), Notice, lambda _, notice: take.put_nowait(notice) if notice else None
-        )
+        """Have notices to people put into a queue, each once: both sides of a partition may have given it."""
+        once = Once()
+
+        def heard(_: str, notice: Notice | None) -> None:
+            if notice is not None and once.new(notice.id):
+                take.put_nowait(notice)
+
+        self.plane.session.subscribe_typed(self.plane.keys.notice(), Notice, heard)
 
     def on_run(self, task: str, take: "asyncio.Queue[RunEvent]") -> None:
         """Have the events of a task's runs put into a queue."""

@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, PayloadError
+from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig
 from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
@@ -48,6 +49,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     plane: PlaneConfig = field(default_factory=PlaneConfig)
     pool: PoolConfig = field(default_factory=PoolConfig)
     llm: LlmConfig = field(default_factory=LlmConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
     robots: RobotsConfig = field(default_factory=RobotsConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     tasks: TasksConfig = field(default_factory=TasksConfig)
@@ -84,6 +86,7 @@ def check(config: GatewayConfig, source: str) -> None:
         config.robots.check()
         config.record.check()
         config.llm.check()
+        config.safety.check()
     except (PayloadError, ConfigError) as error:
         raise ConfigError(f"{source}: {error.message}", remedy=error.remedy) from error
     if config.log_level not in ("debug", "info", "warning", "error"):

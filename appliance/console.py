@@ -5,13 +5,14 @@ Rich finds out whether it writes to a terminal: without one there are no colours
 
 import sys
 from collections.abc import Mapping, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from appliance.console_plan import analysis_text, provenance_text
 from appliance.console_watch import revision_lines
 from appliance.doctor import Check
 from appliance.model import (
@@ -29,7 +30,11 @@ from appliance.model import (
 from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
 from appliance.pool.transfer.api import Brought
+from appliance.reasons import milliseconds
 from appliance.record.facts import LogInfo
+from appliance.record.player import Played
+from appliance.tasks.api import PlanAnswer
+from appliance.tasks.check import CheckReport
 from appliance.tasks.replay import ReplayReport
 
 PIPE_WIDTH = 160
@@ -103,11 +108,14 @@ def plan_graph(plan: Plan) -> Group:
     return Group(head, table)
 
 
-def milliseconds(value: float | None) -> str:
-    """A duration for people."""
-    if value is None:
-        return "–"
-    return f"{value:.1f} ms" if value < 1000 else f"{value / 1000:.1f} s"
+def plan_answer(answer: PlanAnswer) -> Group:
+    """A plan, where it came from, and what it asks for."""
+    parts: list[Group | Text] = [plan_graph(answer.plan)]
+    if answer.plan.provenance is not None:
+        parts.append(provenance_text(answer.plan.provenance))
+    if answer.analysis is not None:
+        parts.append(analysis_text(answer.analysis))
+    return Group(*parts)
 
 
 def brief(record: SubtaskRecord) -> str:
@@ -296,6 +304,12 @@ def robot_table(robots: Sequence[RobotInfo]) -> Table:
         state = "online" if each.online else "offline"
         if each.holding:
             state += f", holds {each.holding}"
+        for words in (*each.estimator, *each.warnings):
+            state += f", {words}"
+        if each.seized:
+            state += f", taken: {each.seized}"
+        elif each.failsafe:
+            state += f", {each.failsafe}"
         table.add_row(
             each.id, each.kind, each.gateway or "itself", ", ".join(each.uses), pose, battery, each.mode, state
         )
@@ -318,6 +332,45 @@ def replay_summary(report: ReplayReport) -> Group:
     return Group(*lines)
 
 
+def check_summary(report: CheckReport) -> Group:
+    """What came of checking logs: the first difference whole, the others in a line."""
+    made = ", ".join(f"{count:,} {what}" for what, count in sorted(report.checked.items())) or "none"
+    lines = [
+        Text(f"{report.messages:,} messages, {report.tasks:,} tasks", style="bold"),
+        Text(f"  made again: {made}"),
+    ]
+    if report.unchecked:
+        missing = ", ".join(f"{count:,} {why}" for why, count in sorted(report.unchecked.items()))
+        lines.append(Text(f"  not checked: {missing}", style="dim"))
+    lines.extend(Text(f"  ! {problem}", style="yellow") for problem in report.problems)
+    if report.same:
+        lines.append(Text("no decision comes out differently", style="green"))
+        return Group(*lines)
+    first, *others = report.divergences
+    at = datetime.fromtimestamp(first.at_ns / 1e9, tz=UTC).isoformat(timespec="milliseconds")
+    lines += [
+        Text(
+            f"{report.diverged:,} decisions come out differently; the first, {first.decider}, at {at} in {first.log}:",
+            style="red",
+        ),
+        Text(f"  {first.what}"),
+        Text(f"    logged  {first.logged}"),
+        Text(f"    now     {first.now}", style="red"),
+        *(Text(f"  {each.decider}: {each.what}", style="dim") for each in others[:10]),
+    ]
+    return Group(*lines)
+
+
+def played_text(played: Played) -> Group:
+    """What came of a replay."""
+    how = "to the end" if played.ended else "stopped"
+    lines = [Text(f"{played.messages:,} messages played in {played.took_s:.1f} s, {how}", style="bold")]
+    if played.left_out:
+        lines.append(Text(f"  {played.left_out:,} orders were left out (--orders plays them)", style="dim"))
+    lines.extend(Text(f"  ! {problem}", style="yellow") for problem in played.problems)
+    return Group(*lines)
+
+
 def log_summary(found: LogInfo) -> Group:
     """What a log holds."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
@@ -332,6 +385,15 @@ def log_summary(found: LogInfo) -> Group:
     notes = [Text(f"! {problem}", style="yellow") for problem in found.problems]
     if found.dropped:
         notes.append(Text(f"! the recorder could not write {found.dropped:,} messages", style="yellow"))
+    if found.not_heard:
+        notes.append(
+            Text(f"! {found.not_heard:,} messages never reached the recorder, by their numbers", style="yellow")
+        )
+    for each in found.incidents:
+        at = datetime.fromtimestamp(each.at_ns / 1e9, tz=UTC).isoformat(timespec="milliseconds")
+        notes.append(Text(f"incident {at} {each.reason} {each.detail} {each.key}".rstrip(), style="bold red"))
+    if found.attachments:
+        notes.append(Text(f"attached: {', '.join(found.attachments)}", style="dim"))
     return Group(head, *notes, table)
 
 

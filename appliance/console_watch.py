@@ -50,7 +50,20 @@ def _figures(line: Line) -> str:
 
 
 def revision_lines(record: TaskRecord) -> Iterator[Text]:
-    """What was changed about a task's plan, and why; and what waits for an operator."""
+    """What was changed about a task's plan, and why; what waits for an operator, and what operators ordered."""
+    if record.paused:
+        yield Text(f"  {record.paused}", style="bold yellow")
+    if record.cancelled_by is not None and record.cancelled_by.by:
+        said = f": {record.cancelled_by.why}" if record.cancelled_by.why else ""
+        yield Text(f"  cancelled by {record.cancelled_by.by}{said}", style="magenta")
+    if record.retried_by is not None:
+        said = f": {record.retried_by.why}" if record.retried_by.why else ""
+        yield Text(f"  tried again by {record.retried_by.by or 'an operator'}{said}", style="dim")
+    if (decision := record.decision) is not None:
+        did = "approved" if decision.approved else "turned down"
+        edited = ", edited" if decision.edited else ""
+        said = f": {decision.why}" if decision.why else ""
+        yield Text(f"  plan {did}{edited} by {decision.by or 'an operator'}{said}", style="dim")
     for each in record.revisions:
         yield Text(f"  revision {each.number} ({each.kind}): {each.note}", style="yellow")
         if each.why:
@@ -59,7 +72,12 @@ def revision_lines(record: TaskRecord) -> Iterator[Text]:
         if changes or each.added:
             yield Text(f"    out: {', '.join(changes) or 'none'}; in: {', '.join(each.added) or 'none'}", style="dim")
     if record.proposal is not None:
-        waits = f": `swiftbot task agree {record.id}` or `--no`" if record.proposal.waits else ""
+        short = record.proposal.hash[:12]
+        waits = (
+            f"\n  waits for `swiftbot task approve {record.id} --hash {short}` or `task reject {record.id}`"
+            if record.proposal.waits
+            else ""
+        )
         yield Text(f"  proposed: {record.proposal.note}{waits}", style="bold yellow")
         for each in record.proposal.plan.subtasks:
             after = f" after {', '.join(each.after)}" if each.after else ""

@@ -12,6 +12,7 @@
     ├── PlanError            no valid plan for the instruction
     ├── PoolError            a container could not be started, reached or kept
     ├── RobotError           a robot did not do what was asked
+    │   └── TakenError       a pilot or a failsafe at the vehicle has it
     ├── RecordError          a log cannot be written or read
     └── CancelledByOperatorError  somebody asked for it to stop
 
@@ -116,6 +117,12 @@ class RobotError(SwiftbotError):
     """A robot did not do what was asked."""
 
     code = "robot"
+
+
+class TakenError(RobotError):
+    """A pilot or a failsafe at the vehicle has it: whoever commands it is to wait until it is given back."""
+
+    code = "taken"
 
 
 class RecordError(SwiftbotError):

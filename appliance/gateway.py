@@ -17,11 +17,15 @@ from pathlib import Path
 
 import msgspec
 import structlog
+from msgspec import Struct
 
 from appliance import logs, service
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, PrerequisiteError, RefusedError, SwiftbotError
+from appliance.limits import orders_of
+from appliance.llm.api import SwapAsk, Swapped
 from appliance.llm.cascade import Decomposer
+from appliance.llm.peers import PeerTier, ProposeAsk, Proposed
 from appliance.model import (
     ContainerInfo,
     ContainerState,
@@ -42,12 +46,15 @@ from appliance.pool.state import ALONE, State
 from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.transfers import Transfers
 from appliance.pool.volumes import Volumes
+from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk
+from appliance.robots.authority.authority import SHOWN, Authority
 from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
-from appliance.tasks.api import ArtifactAsk, RunAsk, TaskAsk, TaskLinesAsk
+from appliance.tasks.api import ArtifactAsk, RunAsk, SiteAsk, TaskAsk, TaskLinesAsk
 from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.bounds import clean
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
@@ -56,6 +63,9 @@ from appliance.tasks.migration.migration import Migration
 from appliance.tasks.migration.overload import Load
 from appliance.tasks.remote import Links, RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
+from appliance.tasks.steering.api import CancelTaskAsk
+from appliance.tasks.steering.audit import Audit
+from appliance.tasks.steering.enquiries import Enquiries
 from appliance.tasks.watch.kept import Kept
 from appliance.vitals import Vitals
 
@@ -95,6 +105,13 @@ class Gateway:
             await self._stack.aclose()
             raise
 
+    def _serve_links(self) -> None:
+        """Answer what is asked and ordered of MAVLink links."""
+        rpc = self.plane.rpc
+        rpc.register("robot_links", LinksAsk, self.hub.links)
+        rpc.register("robot_link_add", LinkAdd, self.hub.add_link)
+        rpc.register("robot_link_remove", LinkRemove, self.hub.remove_link)
+
     async def _start(self) -> None:
         config = self.config
         catalogue, site = self._load()
@@ -103,10 +120,17 @@ class Gateway:
         self._stack.push_async_callback(self.plane.close)
         logs.publish_to(self._put_log)
         self._stack.callback(logs.publish_to, None)
+        await self.plane.until_back()
 
-        self.decomposer = Decomposer(config.llm, catalogue)
-        await self.decomposer.start()
-        self._stack.push_async_callback(self.decomposer.close)
+        await self._start_planner(catalogue)
+
+        audit = Audit(self.plane.session, self.plane.keys, config.id)
+        self._stack.callback(audit.listen().close)
+        orders = orders_of(config, site, roster=lambda: self.plane.registry.robots)
+        self.authority = Authority(self.plane, orders=orders.held)
+        await self.authority.start(audit.signed)
+        self._stack.push_async_callback(self.authority.close)
+        self.authority.on_change.append(self._changed.set)
 
         self.hub = RobotHub(
             config.robots,
@@ -115,15 +139,33 @@ class Gateway:
             gateway=config.id,
             site=site,
             on_task=self._on_robot_task,
-            tasks=Tasks(submit=self._submit_for_robot, cancel=self._cancel_for_robot, look=self._look_for_robot),
+            tasks=Tasks(
+                submit=self._submit_for_link,
+                cancel=self._cancel_for_link,
+                look=self._look_for_robot,
+                submit_of=self._submit_of_robot,
+            ),
+            gate=self.authority.refuses,
         )
         await self.hub.start()
         self._stack.push_async_callback(self.hub.stop)
 
+        self._serve_links()
+
         artifacts = Artifacts(
             self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
         )
-        calls = Calls(self.plane, artifacts, on_wait=self._on_wait)
+        enquiries = Enquiries(self.plane)
+        enquiries.start(audit)
+        self._stack.push_async_callback(enquiries.close)
+        calls = Calls(
+            self.plane,
+            artifacts,
+            on_wait=self._on_wait,
+            hindrance=self.authority.hindrance,
+            enquiries=enquiries,
+            orders=orders.held,
+        )
         state, links = await self._open_state()
         self._remote = remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=links)
 
@@ -143,6 +185,7 @@ class Gateway:
             on_change=self._on_containers,
             state=state,
             store=self.plane.store,
+            on_decided=self._tell_decided,
         )
         self.executor = Executor(self.plane, self.pool, remote, config.tasks)
         self.executor.on_change = self._changed.set
@@ -157,12 +200,13 @@ class Gateway:
         rpc.register("run_status", RunAsk, self.executor.status)
         rpc.register("run_cancel", RunAsk, self.executor.cancel)
         rpc.register("artifact", ArtifactAsk, artifacts.piece)
+
+        async def tell_site(_: SiteAsk) -> Site:
+            return site
+
+        rpc.register("site", SiteAsk, tell_site)
         rpc.register("find_containers", Need, remote.answer)
-        rpc.register("pool_hint", PoolHint, self.pool.verbs.hint)
-        rpc.register("pool_warm", WarmAsk, self.pool.verbs.warm)
-        rpc.register("pool_evict", EvictAsk, self.pool.verbs.evict)
-        rpc.register("pool_release_quarantine", ReleaseAsk, self.pool.verbs.release_quarantine)
-        rpc.register("pool_decisions", DecisionsAsk, self.pool.verbs.decisions)
+        self._serve_operators(audit)
 
         self.manager = TaskManager(
             config.tasks,
@@ -172,8 +216,11 @@ class Gateway:
             executor=self.executor,
             site=site,
             image_of=self._image_names(catalogue),
+            commands=self.authority,
+            audit=audit,
         )
         self.manager.on_change = self._changed.set
+        self.authority.on_change.append(self.manager.look_again)
         self.manager.recovery.on_published = self._kept.hear_transition
         rpc.register("task_lines", TaskLinesAsk, self._kept.answer)
         await self.manager.start()
@@ -188,6 +235,7 @@ class Gateway:
             load=self._own_load,
             volumes_mb=lambda names: self._volumes.size_bytes(names) / 2**20 if self._volumes is not None else 0.0,
             on_change=self._changed.set,
+            audit=audit,
         )
         self.migration.start()
         self._stack.push_async_callback(self.migration.close)
@@ -197,6 +245,30 @@ class Gateway:
         for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
             self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
+
+    async def _start_planner(self, catalogue: Catalogue) -> None:
+        config, plane = self.config, self.plane
+
+        async def ask(gateway: str, asked: ProposeAsk, timeout_s: float) -> Proposed:
+            return await plane.rpc.call(gateway, "propose", asked, Proposed, timeout_s=timeout_s)
+
+        def gateways() -> dict[str, GatewayStatus]:
+            members = plane.members()
+            return {name: status for name, status in plane.registry.gateways.items() if name in members}
+
+        peers = PeerTier(config.llm, gateways=gateways, ask=ask, here=config.id)
+        self.decomposer = Decomposer(
+            config.llm, catalogue, safety=config.safety, gateway=config.id, peers=peers
+        )  # fmt: skip
+        memory = self.decomposer.memory
+        await memory.load(plane.store)
+        await self.decomposer.start()
+        self._stack.push_async_callback(self.decomposer.close)
+        hearing = plane.session.subscribe(
+            plane.keys.task(), lambda message: None if message.deleted else memory.hear(message.key, message.payload)
+        )
+        self._stack.callback(hearing.close)
+        plane.rpc.register("propose", ProposeAsk, self.decomposer.propose)
 
     def _image_names(self, catalogue: Catalogue) -> Callable[[str], str]:
         """Return what gives the full reference of an image; each is worked out once, from what goes into it."""
@@ -302,9 +374,28 @@ class Gateway:
         self.plane.registry.publish_containers(containers)
         self._changed.set()
 
+    def _tell_decided(self, case: Struct, what: str) -> None:
+        self.plane.session.put(self.plane.keys.decided(self.config.id, what), msgspec.json.encode(case))
+
     def _put_log(self, line: LogLine) -> None:
         self._kept.hear_log(line)
         self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
+
+    def _serve_operators(self, audit: Audit) -> None:
+        """Answer what operators order of this gateway's pool and model."""
+        rpc, verbs = self.plane.rpc, self.pool.verbs
+        rpc.register("pool_hint", PoolHint, verbs.hint)
+        rpc.register("pool_warm", WarmAsk, audit.signed("pool_warm", verbs.warm))
+        rpc.register("pool_evict", EvictAsk, audit.signed("pool_evict", verbs.evict))
+        release = audit.signed("pool_release_quarantine", verbs.release_quarantine)
+        rpc.register("pool_release_quarantine", ReleaseAsk, release)
+        rpc.register("pool_decisions", DecisionsAsk, verbs.decisions)
+        rpc.register("llm_swap", SwapAsk, audit.signed("llm_swap", self._swap_model))
+
+    async def _swap_model(self, ask: SwapAsk) -> Swapped:
+        swapped = await self.decomposer.swap(ask.folder)
+        self._publish_status()
+        return swapped
 
     def _on_wait(self, call: Call, note: str) -> None:
         self.executor.waits(call, note)
@@ -324,21 +415,48 @@ class Gateway:
         # Robots are heard before the task manager is there.
         await self._ready.wait()
         try:
-            await self.manager.submit(msgspec.structs.replace(request, submitter=request.submitter or robot))
+            await self._submit_own(robot, request)
         except SwiftbotError as error:
             self._refuse_intake(robot, str(error))
         except Exception as error:  # the boundary to what a robot sent: it is told in the log, and counted
             log.exception("a robot's task broke", robot=robot)
             self._refuse_intake(robot, f"{type(error).__name__}: {error}")
 
-    async def _submit_for_robot(self, request: TaskRequest) -> TaskRecord:
-        """Hand in a task by MAVLink; durable when this returns."""
+    async def _submit_own(self, robot: str, request: TaskRequest) -> TaskRecord:
+        """Hand in a task as the robot's on whose key it came, whomever it names."""
+        safety = self.config.safety
+        if safety.robot_tasks != "any" or (request.plan is not None and safety.confirm_skills):
+            self._check_known(robot)
+        return await self.manager.submit(msgspec.structs.replace(request, submitter=robot))
+
+    def _check_known(self, robot: str) -> None:
+        """Refuse a task on the key of a robot that nobody knows: it would count as an operator's."""
+        if robot not in self.plane.registry.robots:
+            raise RefusedError(
+                f"there is no robot {clean(robot, 80)} that has told its state, and [safety] holds for robots' tasks",
+                remedy="put its state on its key first",
+            )
+
+    async def _submit_of_robot(self, robot: str, request: TaskRequest) -> TaskRecord:
+        """Hand in a task that a robot asked for by query; durable when this returns."""
+        self._check_ready()
+        return await self._submit_own(robot, request)
+
+    async def _submit_for_link(self, request: TaskRequest) -> TaskRecord:
+        """Hand in a task by MAVLink, whose desks say who asked; durable when this returns."""
         self._check_ready()
         return await self.manager.submit(request)
 
-    async def _cancel_for_robot(self, task: str) -> TaskRecord:
+    async def _cancel_for_link(self, task: str, by: str) -> TaskRecord:
+        """Stop a task, as whoever spoke on a link wants; a robot whose tasks may do less stops its own alone."""
         self._check_ready()
-        return await self.manager.cancel(TaskAsk(id=task))
+        if self.config.safety.robot_tasks != "any" and by in self.plane.registry.robots:
+            record = await self.manager.task(TaskAsk(id=task))
+            if record.submitter != by:
+                raise RefusedError(
+                    f"{task} is not a task of {by} (safety.robot_tasks)", remedy="an operator can stop it"
+                )
+        return await self.manager.cancel(CancelTaskAsk(id=task, by=by))
 
     async def _look_for_robot(self, task: str) -> TaskRecord:
         self._check_ready()
@@ -390,7 +508,10 @@ class Gateway:
             images=self._transfers.images() if self._transfers is not None else (),
             volumes=self._volumes.infos() if self._volumes is not None else (),
             models=self.decomposer.models,
+            planner=self.decomposer.status,
             robots=self.hub.attached,
+            stops=self.authority.active[:SHOWN],
+            leases=self.authority.leases[:SHOWN],
             endpoints=self.config.plane.listen,
             refused=dict(counters),
             monitor=dict(self.manager.recovery.counts),

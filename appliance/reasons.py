@@ -7,9 +7,15 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from appliance.console import milliseconds
 from appliance.model import PLAIN_PRIORITY, Choice
 from appliance.tasks.why import AttemptWhy, TaskWhy, Waits
+
+
+def milliseconds(value: float | None) -> str:
+    """A duration for people."""
+    if value is None:
+        return "–"
+    return f"{value:.1f} ms" if value < 1000 else f"{value / 1000:.1f} s"
 
 
 def why_text(found: TaskWhy) -> Group:
@@ -17,6 +23,7 @@ def why_text(found: TaskWhy) -> Group:
     parts: list[RenderableType] = [
         Text.assemble(("task ", "bold"), found.id, f" {found.state}  coordinated by {found.coordinator}"),
         *_task_text(found),
+        *([Text(f"waits for: {found.waits}", style="bold yellow")] if found.waits else []),
     ]
     for each in found.subtasks:
         waits = f"  {each.note}" if each.note and not each.attempts and each.waits is None else ""

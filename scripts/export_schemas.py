@@ -1,6 +1,6 @@
 """Write the JSON schemas of the shared structs to docs/schemas, for tools in other languages and for Foxglove.
 
-They are made, never edited; a test fails when they are behind `appliance/model.py`. Run from the project's root:
+They are made, never edited; a test fails when they are behind `appliance/model`. Run from the project's root:
 
     python scripts/export_schemas.py
 """
@@ -27,7 +27,7 @@ def schemas() -> dict[str, str]:
         for name, value in vars(model).items()
         if inspect.isclass(value)
         and issubclass(value, msgspec.Struct)
-        and value.__module__ == model.__name__
+        and value.__module__.startswith(f"{model.__name__}.")
         and not name.startswith("_")
     }
     made: dict[str, str] = {}

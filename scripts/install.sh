@@ -17,7 +17,7 @@ OPT=$DESTDIR/opt/swiftbot
 LIB=$DESTDIR/usr/local/lib
 UNITS=(swiftbot-gateway.service swiftbot-recorder.service)
 # There when it is wanted: `systemctl enable --now swiftbot-router`.
-OPTIONAL=(swiftbot-router.service)
+OPTIONAL=(swiftbot-router.service swiftbot-foxglove.service)
 
 say() { echo "[install] $*"; }
 die() {
@@ -45,8 +45,10 @@ if [ -z "${WITHOUT_ENVIRONMENT:-}" ]; then
   mkdir -p "$OPT"
   # Relocatable: what is laid out under DESTDIR runs from /opt.
   "$uv" venv --quiet --allow-existing --relocatable --python /usr/bin/python3 "$OPT/venv"
-  "$uv" pip sync --quiet --require-hashes --compile-bytecode --python "$OPT/venv/bin/python" "$PROJECT/locks/gateway.txt" ||
-    die "the packages of locks/gateway.txt" "see the lines above; network, proxy and certificates are the usual reasons"
+  lock=gateway # WITH_FOXGLOVE=1: with the package of the live view; kept once it is there
+  if [ -n "${WITH_FOXGLOVE:-}" ] || compgen -G "$OPT/venv/lib/python3*/site-packages/foxglove" >/dev/null; then lock=foxglove; fi
+  "$uv" pip sync --quiet --require-hashes --compile-bytecode --python "$OPT/venv/bin/python" "$PROJECT/locks/$lock.txt" ||
+    die "the packages of locks/$lock.txt" "see the lines above; network, proxy and certificates are the usual reasons"
   "$uv" pip install --quiet --no-deps --no-index --reinstall --compile-bytecode --python "$OPT/venv/bin/python" "$wheels"/*.whl
   install -d "$DESTDIR/usr/local/bin"
   ln -sfn /opt/swiftbot/venv/bin/swiftbot "$DESTDIR/usr/local/bin/swiftbot"
@@ -105,5 +107,5 @@ systemctl enable --quiet "${UNITS[@]}"
 say "starting (running services drain first)"
 systemctl restart "${UNITS[@]}" ||
   die "the services did not start" "journalctl -u swiftbot-gateway -u swiftbot-recorder -n 50"
-systemctl try-restart "${OPTIONAL[@]}" || say "the router did not come back: journalctl -u swiftbot-router -n 50"
+systemctl try-restart "${OPTIONAL[@]}" || say "one did not come back: journalctl -u swiftbot-router -u swiftbot-foxglove -n 50"
 say "running: systemctl status ${UNITS[*]}"

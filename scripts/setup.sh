@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
 # Makes this machine able to run the appliance, from nothing but git, make and Python 3.11 on Debian.
 #
-#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-ray] [--with-train]
+#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-train]
 #
 # gateway: what a gateway and the demo need. dev: that, and the tools of `make test`. host: only the machine's part
-# (packages, user, ranges, Podman), for `make install`, which puts the program elsewhere. --with-ray: also Ray, which
+# (packages, user, ranges, Podman), for `make install`, which puts the program elsewhere. --with-browser: also Chromium
+# (300 MB), for the test of the terminal UI in a browser; where it cannot be had, that test says so. --with-ray: Ray, which
 # benchmarks compare with; --with-train: also PyTorch, for `swiftbot train`; each in an environment of its own.
 # As root it sets up the service user and works for it; as a user it works in place and asks sudo for system packages
 # and id ranges only. What is there already is kept: a second run takes about a second. docs/operations.md tells more.
@@ -15,16 +16,18 @@ START=$(date +%s%N)
 
 MODE=gateway
 IMAGES=1
+WITH_BROWSER=
 WITH_RAY=
 WITH_TRAIN=
 for argument in "$@"; do
   case $argument in
     gateway | dev | host) MODE=$argument ;;
     --without-images) IMAGES= ;;
+    --with-browser) WITH_BROWSER=1 ;;
     --with-ray) WITH_RAY=1 ;;
     --with-train) WITH_TRAIN=1 ;;
     *)
-      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-ray] [--with-train])" >&2
+      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-train])" >&2
       exit 2
       ;;
   esac
@@ -32,7 +35,7 @@ done
 
 PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
   python3 python3-venv rsync ca-certificates)
-[ "$MODE" = dev ] && PACKAGES+=(systemd iproute2)  # iproute2: tests in network namespaces of their own
+[ "$MODE" = dev ] && PACKAGES+=(systemd iproute2 tmux)  # iproute2: tests in network namespaces; tmux: the terminal UI in one
 API_STALE=
 RANGE=65536           # ids that a rootless container may use
 NEED_FRESH_MB=4000    # environment, its downloads, images: measured 2.6 GB, and room to work
@@ -129,6 +132,14 @@ install_packages() {
   root "system packages: ${missing[*]}" apt-get -q -y -o DPkg::Lock::Timeout=300 -o Acquire::Retries=3 \
     install --no-install-recommends "${missing[@]}"
   say "system packages: done"
+}
+
+# For one test: a machine without it is set up all the same.
+install_browser() {
+  if [ -z "$WITH_BROWSER" ] || command -v chromium >/dev/null; then return; fi
+  say "chromium: installing it"
+  (root "chromium" apt-get -q -y -o DPkg::Lock::Timeout=300 -o Acquire::Retries=3 install --no-install-recommends chromium) ||
+    say "chromium: could not be had; going on"
 }
 
 check_python() {
@@ -360,6 +371,14 @@ PYTHON
   ) 2>/dev/null
 }
 
+# Where /run outlives the processes (a restored machine, or all of the user's processes killed at once), Podman believes
+# that its containers still run, and looks for a pause process that is gone. It says itself what mends that.
+mend_podman() {
+  grep -q 'podman system migrate' "$LOG" || return 1
+  say "podman: it has lost its pause process; resetting it"
+  (cd / && as_user podman system migrate && as_user podman info) >"$LOG" 2>&1
+}
+
 podman_remedy() {
   if grep -qi 'cannot clone' "$LOG"; then
     echo "user namespaces are not permitted here: sysctl kernel.unprivileged_userns_clone=1 user.max_user_namespaces=15000; no chroot; in a container, one that may nest containers"
@@ -377,8 +396,7 @@ start_api() {
   say "podman: starting the API socket $API_SOCKET"
   local pidfile=$RUNTIME_DIR/swiftbot-podman.pid apilog=$RUNTIME_DIR/swiftbot-podman.log pid tries=0
   : >"$LOG"
-  (cd / && as_user podman info) >"$LOG" 2>&1 ||
-    fail "podman does not work for user $RUN_USER" "$(podman_remedy)"
+  (cd / && as_user podman info) >"$LOG" 2>&1 || mend_podman || fail "podman does not work for user $RUN_USER" "$(podman_remedy)"
   if systemd_runs && [ -S "$RUNTIME_DIR/systemd/private" ]; then
     (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user enable --now podman.socket) || exit 1
     # A socket file that lost its listener is made anew; a service ends by itself and starts with the next request.
@@ -431,6 +449,7 @@ if ! flock -n 9; then
   flock -w 900 9 || fail "another setup is running" "wait for it, or end it"
 fi
 install_packages
+install_browser
 if [ -z "${PIP_CERT:-}" ] && [ -e "$CERTIFICATES" ]; then export PIP_CERT=$CERTIFICATES; fi
 check_python
 make_user

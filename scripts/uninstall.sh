@@ -6,7 +6,7 @@ set -euo pipefail
 
 DESTDIR=${DESTDIR:-}
 LIB=$DESTDIR/usr/local/lib
-UNITS=(swiftbot-gateway.service swiftbot-recorder.service swiftbot-router.service)
+UNITS=(swiftbot-gateway.service swiftbot-recorder.service swiftbot-router.service swiftbot-foxglove.service)
 
 say() { echo "[uninstall] $*"; }
 

@@ -22,6 +22,8 @@ SECTIONS = (
     ("pool.weights", "appliance.pool.settings", "Weights"),
     ("pool.pressure", "appliance.pool.settings", "PressureConfig"),
     ("llm", "appliance.llm.settings", "LlmConfig"),
+    ("safety", "appliance.llm.safety.settings", "SafetyConfig"),
+    ("safety.limits", "appliance.llm.safety.settings", "RobotLimits"),
     ("robots", "appliance.robots.settings", "RobotsConfig"),
     ("robots.mavlink", "appliance.robots.settings", "MavlinkLink"),
     ("record", "appliance.record.settings", "RecordConfig"),

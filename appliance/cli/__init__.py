@@ -11,13 +11,28 @@ from cyclopts import App, CycloptsError
 from rich.markup import escape
 
 from appliance import console, logs
-from appliance.cli import bench, daemons, fleet, moves, pool, robots, tools, train, work
+from appliance.cli import (
+    bench,
+    daemons,
+    fleet,
+    hands,
+    moves,
+    plane,
+    planning,
+    pool,
+    recordings,
+    robots,
+    steer,
+    tools,
+    train,
+    work,
+)
 from appliance.errors import SwiftbotError
 
 app = App(
     name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
 )
-for part in (fleet, work, moves, daemons, pool, robots, tools, train, bench):
+for part in (fleet, work, planning, moves, steer, daemons, pool, robots, hands, recordings, plane, tools, train, bench):
     part.add_to(app)
 
 

@@ -18,6 +18,8 @@ TOOLS = Group("Logs, images, checks", sort_key=4)
 
 Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 
+Why = Annotated[str, Parameter(help="Why, for the audit and for those who wonder.")]
+
 
 @Parameter(name="*")
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """What runs until it is told to stop: `swiftbot gateway`, `record`, `sim …`."""
 
 import asyncio
+import os
 import signal
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,7 +18,7 @@ sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
 
 def add_to(app: App) -> None:
     """Add these commands."""
-    for command in (gateway, router, record):
+    for command in (gateway, router, record, foxglove):
         app.command(command, group=DAEMONS)
     app.command(sim_app)
 
@@ -79,11 +80,15 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
     """
     from appliance import config as configuration
     from appliance.plane.settings import PlaneConfig
+    from appliance.record.about import about
     from appliance.record.recorder import run_recorder
     from appliance.record.settings import RecordConfig
+    from appliance.skills.sites import load_site
 
+    told = about({}, os.environ)
     if config is not None:
         loaded = configuration.load(config)
+        told = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
         logs.configure(level=loaded.log_level, style=loaded.log_format)
         fleet, settings = loaded.fleet, loaded.record
         connect = (*loaded.plane.listen, *loaded.plane.connect)
@@ -97,7 +102,51 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
     async def go() -> None:
         # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
         plane = PlaneConfig(mode="peer", connect=connect)
-        await run_recorder(settings, plane, fleet, _until_signalled(), alive=_tell_systemd)
+        await run_recorder(settings, plane, fleet, _until_signalled(), alive=_tell_systemd, about=told)
+
+    uvloop.run(go())
+    return 0
+
+
+def foxglove(
+    *,
+    config: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    keys: Annotated[tuple[str, ...], Parameter(name="--key", negative="", help="Only keys that match.")] = (),
+    where: Where = HERE,
+) -> int:
+    """Show the running fleet in Foxglove: open ws://127.0.0.1:8765 there. Until SIGTERM or Ctrl-C.
+
+    The same channels and schemas as in a log. Needs the extra `foxglove`.
+
+    Args:
+        config: A gateway's TOML file: its fleet and endpoints, its site for the map.
+        host: Loopback only, since whoever connects sees everything.
+        port: Port to listen on; 0: any.
+        where: The fleet, when no configuration is given.
+    """
+    from appliance import config as configuration
+    from appliance.plane.settings import PlaneConfig
+    from appliance.record.about import about
+    from appliance.record.live import LiveOptions, serve
+    from appliance.skills.sites import load_site
+
+    told = about({}, os.environ)
+    if config is not None:
+        loaded = configuration.load(config)
+        logs.configure(level=loaded.log_level, style=loaded.log_format)
+        told = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
+        fleet, connect = loaded.fleet, (*loaded.plane.listen, *loaded.plane.connect)
+    else:
+        endpoint = where.endpoint()
+        fleet, connect = endpoint.fleet, endpoint.connect
+        logs.configure(style="text")
+
+    async def go() -> None:
+        options = LiveOptions(host=host, port=port, keys=keys)
+        plane = PlaneConfig(mode="peer", connect=connect)
+        await serve(options, plane, fleet, _until_signalled(), about=told, told=_tell_systemd)
 
     uvloop.run(go())
     return 0
@@ -124,8 +173,15 @@ def mavlink(
     site: str = "warehouse",
     rate: float = 1.0,
     start: str = "home",
+    kind: Literal["copter", "rover"] = "copter",
+    parameter: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    drop: float = 0.0,
+    double: float = 0.0,
+    mix: float = 0.0,
+    delay_s: float = 0.0,
+    seed: int = 1,
 ) -> int:
-    """Simulate a MAVLink copter that sends to a gateway, or waits for one.
+    """Simulate a MAVLink vehicle that sends to a gateway, or waits for one.
 
     Args:
         to: Where the gateway listens, udp://host:port or tcp://host:port.
@@ -134,12 +190,33 @@ def mavlink(
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
         start: Place it starts at.
+        kind: A multirotor or a rover.
+        parameter: NAME=VALUE of its autopilot that differ from the usual, such as SIM_WIND_SPD=6 or FENCE_ENABLE=1.
+        drop: Share of frames that its link loses, each way.
+        double: Share of frames that arrive twice.
+        mix: Share of frames that arrive after later ones.
+        delay_s: Time that frames are on their way.
+        seed: Of the link's chances: the same one loses the same frames.
     """
-    from appliance.robots.sim.mavlink import VehicleSettings, run_vehicle
+    from appliance.robots.sim.mavlink import VehicleSettings, read_parameters, run_vehicle
     from appliance.skills.sites import load_site
 
     logs.configure(style="text")
-    settings = VehicleSettings(to=to, listen=listen, system=system, site=load_site(site), rate=rate, start=start)
+    settings = VehicleSettings(
+        to=to,
+        listen=listen,
+        system=system,
+        site=load_site(site),
+        rate=rate,
+        start=start,
+        kind=kind,
+        parameters=read_parameters(parameter),
+        drop=drop,
+        double=double,
+        mix=mix,
+        delay_s=delay_s,
+        seed=seed,
+    )
 
     async def go() -> None:
         await run_vehicle(settings, stop=_until_signalled())

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import HERE, WORK, Json, Where, show
+from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.cli.work import task_app
 from appliance.client import FleetClient
 from appliance.errors import SwiftbotError
@@ -27,6 +27,7 @@ def task_migrate(
     subtask: str,
     *,
     to: Annotated[str, Parameter(help="The gateway that is to take it; by default the closest.")] = "",
+    why: Why = "",
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -39,7 +40,7 @@ def task_migrate(
     async def go() -> Migrated:
         async with FleetClient(where.endpoint()) as client:
             try:
-                return await client.migrate(MigrateAsk(task=task, subtask=subtask, to=to))
+                return await client.migrate(MigrateAsk(task=task, subtask=subtask, to=to, why=why))
             except asyncio.CancelledError:
                 await _call_off(client, task, subtask)
                 raise
@@ -75,6 +76,7 @@ def drain(
     deadline: Annotated[
         float, Parameter(help="Seconds after which runs that are left are cancelled and repeated elsewhere; 0: never.")
     ] = 0.0,
+    why: Why = "",
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -82,7 +84,7 @@ def drain(
 
     async def go() -> DrainState:
         async with FleetClient(where.endpoint()) as client:
-            state = await client.drain(gateway, deadline)
+            state = await client.drain(gateway, deadline, why=why)
             told = ""
             while wait and state.draining and not state.done:
                 if (text := _progress(state)) != told and not as_json:
@@ -97,12 +99,12 @@ def drain(
     return 0 if state.done or not wait else 1
 
 
-def undrain(gateway: str, *, as_json: Json = False, where: Where = HERE) -> int:
+def undrain(gateway: str, *, why: Why = "", as_json: Json = False, where: Where = HERE) -> int:
     """Have a gateway take runs again."""
 
     async def go() -> DrainState:
         async with FleetClient(where.endpoint()) as client:
-            return await client.undrain(gateway)
+            return await client.undrain(gateway, why=why)
 
     state = asyncio.run(go())
     show(state, as_json=as_json, table=_progress(state))

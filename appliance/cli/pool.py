@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import HERE, WORK, Json, Where, show
+from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.client import FleetClient
 from appliance.errors import ConfigError
 from appliance.pool.api import WarmAsk
@@ -67,6 +67,7 @@ def pool_warm(
     keep: float = 600.0,
     wait: float = 30.0,
     gateway: Gateway = "",
+    why: Why = "",
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -78,6 +79,7 @@ def pool_warm(
         keep: For how long they are kept, seconds.
         wait: How long to wait until they are ready, seconds; 0: not at all.
         gateway: Which gateway's pool; any when none is given.
+        why: Why, for the audit.
         as_json: Print JSON.
         where: The fleet.
     """
@@ -85,7 +87,7 @@ def pool_warm(
     async def go() -> bool:
         async with FleetClient(where.endpoint()) as client:
             name = gateway or await client.gateway()
-            found = await client.pool_warm(name, WarmAsk(image=image, count=count, keep_s=keep, wait_s=wait))
+            found = await client.pool_warm(name, WarmAsk(image=image, count=count, keep_s=keep, wait_s=wait, why=why))
         show(
             {"gateway": name, "image": found.image, "ready": found.ready, "starting": found.starting}
             | ({"problem": found.problem} if found.problem else {}),
@@ -99,19 +101,20 @@ def pool_warm(
 
 
 @pool_app.command(name="evict")
-def pool_evict(name: str, *, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
+def pool_evict(name: str, *, gateway: Gateway = "", why: Why = "", as_json: Json = False, where: Where = HERE) -> int:
     """Give up one idle container, or all idle ones of an image.
 
     Args:
         name: A container's id, or the beginning of it; or an image.
         gateway: Of which gateway; without, the one that holds the container, or all for an image.
+        why: Why, for the audit.
         as_json: Print JSON.
         where: The fleet.
     """
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
-            found = await client.pool_evict(name, gateway)
+            found = await client.pool_evict(name, gateway, why=why)
         rows = [
             {"gateway": each, "evicted": list(answer.containers), "kept": answer.kept, "note": answer.note}
             for each, answer in sorted(found.items())
@@ -123,19 +126,22 @@ def pool_evict(name: str, *, gateway: Gateway = "", as_json: Json = False, where
 
 
 @pool_app.command(name="release")
-def pool_release(image: str, *, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
+def pool_release(
+    image: str, *, gateway: Gateway = "", why: Why = "", as_json: Json = False, where: Where = HERE
+) -> int:
     """Start containers of an image again that is in quarantine because it kept failing.
 
     Args:
         image: Name of the image.
         gateway: On which gateway; all where it is in quarantine when none is given.
+        why: Why, for the audit.
         as_json: Print JSON.
         where: The fleet.
     """
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
-            found = await client.pool_release(image, gateway)
+            found = await client.pool_release(image, gateway, why=why)
         rows = [{"gateway": each, "image": image, "reason": found[each].reason} for each in sorted(found)]
         lines = [f"{each}: {image} is started again; it was left alone: {found[each].reason}" for each in sorted(found)]
         show(rows, as_json=as_json, table="\n".join(lines))

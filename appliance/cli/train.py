@@ -58,15 +58,30 @@ def train_fit(run: Path, *options: Annotated[str, Parameter(allow_leading_hyphen
 
 
 @train_app.command(name="export")
-def train_export(run: Path, folder: Path, *, precision: str = "int4") -> int:
+def train_export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -> int:
     """Make the model folder for `llm.local_model` of a run, its confidence calibrated on the held-out pairs.
 
     Args:
         run: Folder of the run.
         folder: Where to; must not exist.
         precision: int4, int8 or fp32.
+        most: Held-out pairs to calibrate on; 0 for all.
     """
-    _with_torch("appliance.llm.train.export", [str(run), str(folder), "--precision", precision])
+    arguments = [str(run), str(folder), "--precision", precision, "--most", str(most)]
+    _with_torch("appliance.llm.train.export", arguments)
+
+
+@train_app.command(name="tune")
+def train_tune(run: Path, folder: Path, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
+    """Fine-tune a trained run for a site, with its own skills and logged plans; then `export` it as any.
+
+    Args:
+        run: Folder of the training run to begin with.
+        folder: Where the tuned run is kept.
+        options: As `swiftbot train tune RUN FOLDER -- --help` tells: --plans JSONL (needed), --skills FOLDER,
+            --minutes, --steps, --share, ...
+    """
+    _with_torch("appliance.llm.train.tune", [str(run), str(folder), *options])
 
 
 def _with_torch(module: str, arguments: list[str]) -> NoReturn:

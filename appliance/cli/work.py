@@ -1,8 +1,10 @@
-"""Work with a fleet: `swiftbot submit`, `plan`, `task …`, `fleet`, `tui`."""
+"""Work with a fleet: `swiftbot submit`, `task …`, `fleet`, `tui`."""
 
 import asyncio
 import os
+import signal
 import uuid
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -11,10 +13,10 @@ from cyclopts.validators import Number
 
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
-from appliance.client import FleetClient
+from appliance.client import Endpoint, FleetClient
 from appliance.console_watch import stream_line
-from appliance.errors import NotFoundError, PayloadError, SwiftbotError
-from appliance.model import PLAIN_PRIORITY, TaskRecord, TaskRequest, TaskState
+from appliance.errors import ConfigError, NotFoundError, PayloadError, SwiftbotError
+from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
 from appliance.tasks.view import view
 
@@ -23,21 +25,9 @@ task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agr
 
 def add_to(app: App) -> None:
     """Add these commands."""
-    for command in (plan, submit, fleet, tui):
+    for command in (submit, fleet, tui):
         app.command(command, group=WORK)
     app.command(task_app)
-
-
-def plan(text: str, *, as_json: Json = False, where: Where = HERE) -> int:
-    """Decompose an instruction and print the plan; nothing is run."""
-
-    async def go() -> None:
-        async with FleetClient(where.endpoint()) as client:
-            answer = await client.plan(text)
-        show(answer, as_json=as_json, table=console.plan_graph(answer.plan))
-
-    asyncio.run(go())
-    return 0
 
 
 def submit(
@@ -57,6 +47,9 @@ def submit(
     group: Annotated[
         tuple[str, ...], Parameter(help="A gateway that may serve it; repeat for several. None: whichever can.")
     ] = (),
+    approval: Annotated[
+        Approval, Parameter(help="Whether its plan is to be approved before anything runs (`task approve`).")
+    ] = Approval.NEVER,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -71,6 +64,7 @@ def submit(
         priority=priority,
         deadline_s=deadline,
         group=group,
+        approval=approval,
     )
 
     async def go() -> TaskRecord:
@@ -204,11 +198,11 @@ def task_agree(
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
-    """Agree to the plan that is proposed for a task after a failure, or turn it down."""
+    """Agree to the plan of a task that waits, whichever it is, or turn it down; `task approve` names the one meant."""
 
     async def go() -> TaskRecord:
         async with FleetClient(where.endpoint()) as client:
-            return await client.agree(task, agree=not no, by=_me())
+            return await client.agree(task, agree=not no, by=client.operator)
 
     record = asyncio.run(go())
     show(view(record), as_json=as_json, table=console.task_table(record))
@@ -236,12 +230,18 @@ def task_why(task: str, subtask: str = "", *, as_json: Json = False, where: Wher
 
 
 @task_app.command(name="cancel")
-def task_cancel(task: str, *, as_json: Json = False, where: Where = HERE) -> int:
+def task_cancel(
+    task: str,
+    *,
+    why: Annotated[str, Parameter(help="Why, for the audit and the record.")] = "",
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
     """Stop a task; returns when it has ended."""
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
-            record = await client.cancel(task)
+            record = await client.cancel(task, why=why)
             if not record.state.final:
                 console.err.print(f"task {task} is being cancelled")
             async for record in client.watch(task):  # noqa: B007 - the last one is shown
@@ -265,11 +265,60 @@ def fleet(*, as_json: Json = False, where: Where = HERE) -> int:
     return 0
 
 
-def tui(*, where: Where = HERE) -> int:
-    """Open the terminal UI on a fleet."""
+def tui(
+    *,
+    write: Annotated[
+        bool, Parameter(negative="", help="Start unlocked; without, nothing can be changed before `:write`.")
+    ] = False,
+    theme: Annotated[
+        str, Parameter(help="dark, light, blind-dark, blind-light, contrast-dark or contrast-light.")
+    ] = "",
+    config: Annotated[
+        Path | None, Parameter(help="Own settings and keys, TOML; else ~/.config/swiftbot/tui.toml, if there is one.")
+    ] = None,
+    replay: Annotated[
+        Path | None, Parameter(help="Show this recorded log (MCAP) instead of a fleet: play, pause, seek.")
+    ] = None,
+    serve: Annotated[
+        bool, Parameter(negative="", help="Serve it to browsers on this machine; prints an address with a token.")
+    ] = False,
+    port: Annotated[int, Parameter(help="Where --serve listens on 127.0.0.1; 0: any that is free.")] = 0,
+    where: Where = HERE,
+) -> int:
+    """Open the terminal UI on a fleet or on a recorded log, here or in a browser."""
     from appliance.plane.settings import PlaneConfig
-    from appliance.tui.app import run_tui
+    from appliance.tui import settings
+    from appliance.tui.running import run_tui
 
-    endpoint = where.endpoint()
-    asyncio.run(run_tui(PlaneConfig(mode="client", connect=endpoint.connect), endpoint.fleet))
+    own = settings.load(config)
+    own = msgspec.structs.replace(own, write=own.write or write, theme=theme or own.theme)
+    if replay is not None and serve:
+        raise ConfigError(
+            "--serve shows a fleet", remedy="open the log in the browser by `:open FILE`, or leave --serve"
+        )
+    endpoint = Endpoint(fleet=where.fleet, connect=()) if replay is not None else where.endpoint()
+    if serve:
+        _serve_tui(endpoint, port=port, write=own.write)
+    else:
+        plane = PlaneConfig(mode="client", connect=endpoint.connect)
+        asyncio.run(run_tui(plane, endpoint.fleet, own, replay=replay))
     return 0
+
+
+def _serve_tui(endpoint: Endpoint, *, port: int, write: bool) -> None:
+    """Serve the terminal UI until SIGTERM or Ctrl-C."""
+    from appliance.tui.serve.running import serve
+
+    async def go() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+
+        def tell(address: str) -> None:
+            # Flushed: whoever started it as a process waits for the address.
+            print(address, flush=True)
+            console.err.print("whoever knows this address may look, and unlock; Ctrl-C ends it")
+
+        await serve(endpoint.fleet, endpoint.connect, port=port, write=write, stop=stop, tell=tell)
+
+    asyncio.run(go())

@@ -15,6 +15,7 @@ from appliance.doctor.check import SETUP, Check
 from appliance.doctor.containers import check_podman
 from appliance.doctor.machine import Machine, ThisMachine
 from appliance.errors import SwiftbotError
+from appliance.llm.embedded import folder_of
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import Engine, PodmanEngine
@@ -207,12 +208,12 @@ def check_model(machine: Machine, folder: str) -> Check:
     """The local language model's folder, where one is configured."""
     if not folder:
         return Check(name="model", ok=True, detail="none configured: plans come from the other tiers", required=False)
-    ok = machine.stat(Path(folder) / "genai_config.json") is not None
+    ok = machine.stat(Path(folder_of(folder)) / "genai_config.json") is not None
     return Check(
         name="model",
         ok=ok,
         detail=folder if ok else f"{folder} has no genai_config.json",
-        remedy="set llm.local_model to a folder made for onnxruntime-genai, or leave it empty",
+        remedy='set llm.local_model to "embedded" or to a folder made for onnxruntime-genai, or to "" for none',
         required=False,
     )
 

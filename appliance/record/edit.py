@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from mcap.records import Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
 from msgspec import Struct
 
@@ -148,6 +148,7 @@ class _Copy:
         self._progress = progress
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
+        self._attached: set[tuple[str, bytes]] = set()
 
     def run(self, paths: Sequence[Path]) -> None:
         writer = self._writer
@@ -178,6 +179,9 @@ class _Copy:
             if isinstance(record, Metadata):
                 self._writer.add_metadata(record.name, record.metadata)
                 continue
+            if isinstance(record, Attachment):
+                self._attach(record)
+                continue
             if isinstance(record, Channel):
                 numbers.pop(record.id, None)
                 continue
@@ -192,6 +196,14 @@ class _Copy:
             latest = max(latest, record.log_time)
             place += 1
             yield latest, index, place, numbers[record.channel_id], record
+
+    def _attach(self, record: Attachment) -> None:
+        """Carry an attachment over, once: files of one recorder all begin with the same."""
+        if (record.name, record.data) not in self._attached:
+            self._attached.add((record.name, record.data))
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
 
     def _number(self, channel: Channel, schema: Schema | None) -> int:
         schema_number = 0

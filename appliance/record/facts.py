@@ -23,13 +23,16 @@ class Gap(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Messages that are not in the log, and why: what was dropped is itself written down."""
 
     reason: str
-    """`queue full`, `disk full`, `too large` or `write error`."""
+    """`queue full`, `disk full`, `too large` or `write error`: dropped here. `not heard`: numbers that a speaker left
+    out, or that were lost on the way here (see `source`)."""
     dropped: int
     payload_bytes: int = 0
     since_ns: int = 0
     until_ns: int = 0
     last_key: str = ""
     """Key of the last message dropped, as a hint."""
+    source: str = ""
+    """Of what was not heard: whose numbers have a hole, such as `log`, `run`, `transition` or `mavlink`."""
 
 
 class Deletion(Struct, frozen=True, kw_only=True):
@@ -39,13 +42,33 @@ class Deletion(Struct, frozen=True, kw_only=True):
     at_ns: int
 
 
+class Trigger(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Somebody, or something, says that what has just happened is worth keeping."""
+
+    reason: str
+    by: str = ""
+
+
+class Incident(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What made the recorder keep what it has, in the log at the place where it happened."""
+
+    reason: str
+    """`task failed`, `failsafe`, `stop` or `asked`."""
+    detail: str = ""
+    key: str = ""
+    """Of the message that told it."""
+    at_ns: int = 0
+    before_s: float = 0.0
+    """How far back the log goes from here, where it had waited in the ring."""
+
+
 class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A recorder's account of itself, put every second."""
 
     id: str
     fleet: str
     state: str = "starting"
-    """`recording`, `paused` (see `problem`), `failed` or `stopped`."""
+    """`recording`, `waiting` (for an incident), `paused` (see `problem`), `failed` or `stopped`."""
     problem: str = ""
     file: str = ""
     """File name within the recorder's directory."""
@@ -55,6 +78,16 @@ class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     queued: int = 0
     dropped: dict[str, int] = field(default_factory=dict[str, int])
     """Messages not recorded, by reason."""
+    not_heard: dict[str, int] = field(default_factory=dict[str, int])
+    """Messages that never came here, by whose numbers they are missing from."""
+    redacted: int = 0
+    """Messages from which a secret was taken."""
+    incidents: int = 0
+    last_incident: str = ""
+    held: int = 0
+    """Messages that wait in the ring for an incident."""
+    removed: int = 0
+    """Old files removed to stay within the disk budget."""
     started_ns: int = 0
     at_ns: int = 0
 
@@ -81,6 +114,11 @@ class LogInfo(Struct, frozen=True, kw_only=True):
     """The file was not finished (recorder killed, power cut, disk full): all whole chunks of it were read."""
     dropped: int = 0
     """Messages that the recorder could not write, by its own account in the log's gaps."""
+    not_heard: int = 0
+    """Messages that never reached the recorder, by the numbers that speakers give to theirs."""
+    attachments: tuple[str, ...] = ()
+    """Names of what is attached: the configuration, the versions, plans."""
+    incidents: tuple[Incident, ...] = ()
     problems: tuple[str, ...] = ()
     metadata: dict[str, str] = {}
     """Fleet, version, recorder and start, as the recorder wrote them."""

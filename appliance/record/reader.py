@@ -4,22 +4,24 @@ A finished file is summed up from its index at once; any other is streamed (see 
 order in which they were recorded, which is what a replay wants.
 """
 
+import contextlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import msgspec
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 
 from appliance.errors import RecordError
 from appliance.record.expressions import compile_expression
-from appliance.record.facts import ChannelInfo, Deletion, Gap, LoggedMessage, LogInfo
+from appliance.record.facts import ChannelInfo, Deletion, Gap, Incident, LoggedMessage, LogInfo
 from appliance.record.records import BROKEN, RecordStream, open_log
 from appliance.record.writer import METADATA
 
 _GAPS = compile_expression("swiftbot/*/recorder/*/gap")
+_INCIDENTS = compile_expression("swiftbot/*/recorder/*/incident")
 _DELETIONS = compile_expression("swiftbot/*/recorder/*/deleted")
 
 
@@ -97,26 +99,54 @@ def logged(channel: Channel, message: Message) -> LoggedMessage:
     return LoggedMessage(channel.topic, message.log_time, message.data, encoding)
 
 
-def _gap_size(data: bytes) -> int:
-    try:
-        return msgspec.json.decode(data, type=Gap).dropped
-    except msgspec.MsgspecError:
-        return 0
+class _Account:
+    """What the recorder itself wrote down: what is missing, and what happened."""
+
+    def __init__(self) -> None:
+        self.dropped = self.not_heard = 0
+        self.incidents: list[Incident] = []
+
+    def gap(self, data: bytes) -> None:
+        try:
+            gap = msgspec.json.decode(data, type=Gap)
+        except msgspec.MsgspecError:
+            return
+        if gap.source:
+            self.not_heard += gap.dropped
+        else:
+            self.dropped += gap.dropped
+
+    def incident(self, data: bytes) -> None:
+        with contextlib.suppress(msgspec.MsgspecError):
+            self.incidents.append(msgspec.json.decode(data, type=Incident))
+
+    def take(self, topic: str, data: bytes) -> None:
+        if _GAPS.fullmatch(topic):
+            self.gap(data)
+        elif _INCIDENTS.fullmatch(topic):
+            self.incident(data)
 
 
 def _by_streaming(path: Path) -> LogInfo:
     stream = RecordStream(path)
     counts: dict[int, int] = {}
-    start = end = dropped = 0
+    start = end = 0
+    account = _Account()
+    attachments: list[str] = []
     metadata: dict[str, str] = {}
+    told: dict[int, bool] = {}
     for record in stream:
         if isinstance(record, Message):
             number, at = record.channel_id, record.log_time
             start = at if not counts else min(start, at)
             end = max(end, at)
             counts[number] = counts.get(number, 0) + 1
-            if _GAPS.fullmatch(stream.channels[number].topic):
-                dropped += _gap_size(record.data)
+            if told.get(number):
+                account.take(stream.channels[number].topic, record.data)
+        elif isinstance(record, Channel):
+            told[record.id] = _is_told(record.topic)
+        elif isinstance(record, Attachment):
+            attachments.append(record.name)
         elif isinstance(record, Metadata) and record.name == METADATA:
             metadata = record.metadata
     problems = list(stream.problems)
@@ -132,7 +162,10 @@ def _by_streaming(path: Path) -> LogInfo:
         start_ns=start,
         end_ns=end,
         recovered=not stream.finished,
-        dropped=dropped,
+        dropped=account.dropped,
+        not_heard=account.not_heard,
+        attachments=tuple(attachments),
+        incidents=tuple(account.incidents),
         problems=tuple(problems),
         metadata=metadata,
     )
@@ -148,8 +181,10 @@ def _from_index(path: Path) -> LogInfo | None:
                 return None
             assert summary.statistics is not None  # noqa: S101 - _complete has seen it
             counts = summary.statistics.channel_message_counts
-            gaps = {channel.topic for channel in summary.channels.values() if _GAPS.fullmatch(channel.topic)}
-            dropped = sum(_gap_size(message.data) for _, _, message in reader.iter_messages(topics=gaps)) if gaps else 0
+            account = _Account()
+            if told := {channel.topic for channel in summary.channels.values() if _is_told(channel.topic)}:
+                for _, channel, message in reader.iter_messages(topics=told):
+                    account.take(channel.topic, message.data)
             metadata: dict[str, str] = {}
             for found in reader.iter_metadata():
                 if found.name == METADATA:
@@ -163,9 +198,16 @@ def _from_index(path: Path) -> LogInfo | None:
             channels=_channels(summary.channels, summary.schemas, counts),
             start_ns=summary.statistics.message_start_time,
             end_ns=summary.statistics.message_end_time,
-            dropped=dropped,
+            dropped=account.dropped,
+            not_heard=account.not_heard,
+            attachments=tuple(each.name for each in summary.attachment_indexes),
+            incidents=tuple(account.incidents),
             metadata=metadata,
         )
+
+
+def _is_told(topic: str) -> bool:
+    return bool(_GAPS.fullmatch(topic) or _INCIDENTS.fullmatch(topic))
 
 
 def _complete(summary: Summary) -> bool:

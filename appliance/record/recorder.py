@@ -1,6 +1,6 @@
 """The recorder: everything that is put under the fleet's keys goes into a file, and logging never slows the plane.
 
-Zenoh's callback only appends to a bounded intake; a thread of its own encodes, compresses and syncs. What does
+One thread hands over what Zenoh has queued to a bounded intake, another encodes, compresses and syncs. What does
 not fit is dropped, counted and written down in the log itself as a gap: a log that lacks something says so.
 """
 
@@ -9,16 +9,17 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 import structlog
 from msgspec import Struct, structs
 
 from appliance.errors import RecordError
 from appliance.model import encode
-from appliance.plane.session import Message, Session
+from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
+from appliance.record.about import About
 from appliance.record.facts import LoggedMessage, RecorderStatus
+from appliance.record.pipeline import Pipeline
 from appliance.record.settings import RecordConfig
 from appliance.record.writer import LogWriter
 
@@ -27,14 +28,13 @@ log = structlog.get_logger(__name__)
 _STOP_S = 30.0
 """How long a stop waits for the thread: a slow disk may hold many queued pictures."""
 _TICK_S = 0.1
+PATIENCE_S = 0.5
+"""How long a burst that is faster than the disk waits for room: it is slowed down rather than lost. A disk that stands
+still for longer costs messages, since holding back the fleet would cost more."""
+_TICK_EVERY = 2_000
+"""Messages of one batch between two looks at what is due."""
 _STUCK_S = 10.0
 """A writer thread that has not come round for so long is no longer called alive."""
-
-
-class Closer(Protocol):
-    """What a subscription gives back."""
-
-    def close(self) -> None: ...  # noqa: D102
 
 
 class Drop(Struct, frozen=True):
@@ -56,6 +56,8 @@ class Intake:
         self._most, self._most_bytes = messages, payload_bytes
         self._lock = threading.Lock()
         self._some = threading.Event()
+        self._room = threading.Event()
+        self._stuck = False
         self._waiting: list[LoggedMessage] = []
         self._bytes = 0
         self._drops: dict[str, Drop] = {}
@@ -73,6 +75,30 @@ class Intake:
         self._some.set()
         return not full
 
+    def put_all(self, messages: list[LoggedMessage]) -> None:
+        """Add messages in order. A burst waits a moment for room; what does not fit then is dropped and counted."""
+        self._make_way(messages)
+        sizes = sum(len(each.payload) for each in messages)
+        with self._lock:
+            fits = len(self._waiting) + len(messages) <= self._most and self._bytes + sizes <= self._most_bytes
+            if fits:
+                self._waiting += messages
+                self._bytes += sizes
+        if fits:
+            self._some.set()
+        else:
+            for each in messages:
+                self.put(each)
+
+    def _make_way(self, messages: list[LoggedMessage]) -> None:
+        """Wait until the writer has taken what is there, unless it does not come round: then nothing waits for it."""
+        with self._lock:
+            if len(self._waiting) + len(messages) <= self._most or self._stuck:
+                return
+            self._room.clear()
+        if not self._room.wait(PATIENCE_S):
+            self._stuck = True
+
     def lose(self, reason: str, drop: Drop) -> None:
         """Count messages that were lost here or before they came here."""
         with self._lock:
@@ -88,6 +114,8 @@ class Intake:
             self._some.clear()
             out, self._waiting, self._bytes = self._waiting, [], 0
             drops, self._drops = self._drops, {}
+            self._stuck = False
+            self._room.set()
         return out, drops
 
     def wake(self) -> None:
@@ -106,12 +134,23 @@ class Recorder:
         session: The plane's session; its fleet is what is recorded.
         config: Where and how.
         writer: Takes the place of the file writer in tests.
+        about: What the log is to be understood by, and must not hold.
     """
 
-    def __init__(self, session: Session, config: RecordConfig, *, writer: LogWriter | None = None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        config: RecordConfig,
+        *,
+        writer: LogWriter | None = None,
+        about: About | None = None,
+    ) -> None:
         self._session = session
         self._config = config
-        self._writer = writer or LogWriter(config, fleet=session.keys.fleet)
+        about = about or About()
+        fleet = session.keys.fleet
+        self._writer = writer or LogWriter(config, fleet=fleet, site=about.site, attached=about.attached)
+        self._pipeline = Pipeline(config, fleet=fleet, writer=self._writer, secrets=about.secrets)
         self._intake = Intake(messages=config.queue_messages, payload_bytes=config.queue_bytes)
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -133,14 +172,16 @@ class Recorder:
         await asyncio.to_thread(self._writer.prepare)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
-        self._subscription = self._session.subscribe(self._session.keys.everything(), self._take)
+        self._subscription = await asyncio.to_thread(
+            self._session.flood, self._session.keys.everything(), LoggedMessage, self._intake.put_all
+        )
         self._reporting = asyncio.create_task(self._report(), name="recorder status")
         log.info("recorder started", directory=str(self._config.folder), fleet=self._session.keys.fleet)
 
     async def stop(self) -> None:
         """Take no more, write what waits, finish the file."""
         if self._subscription is not None:
-            self._subscription.close()
+            await asyncio.to_thread(self._subscription.close)
             self._subscription = None
         if self._reporting is not None:
             self._reporting.cancel()
@@ -162,17 +203,6 @@ class Recorder:
         self._thread = None
         self._publish()
 
-    def _take(self, message: Message) -> None:
-        self._intake.put(
-            LoggedMessage(
-                key=message.key,
-                at_ns=message.at_ns or time.time_ns(),
-                payload=message.payload,
-                encoding=message.encoding,
-                deleted=message.deleted,
-            )
-        )
-
     def _run(self) -> None:
         try:
             while not (self._stopping.is_set() and not len(self._intake)):
@@ -186,13 +216,19 @@ class Recorder:
             self._snapshot("failed", self.failed)
 
     def _write(self, batch: list[LoggedMessage], drops: dict[str, Drop]) -> None:
-        for message in batch:
-            self._writer.write(message)
+        pipeline = self._pipeline
+        for number, message in enumerate(batch, start=1):
+            pipeline.write(message)
+            if number % _TICK_EVERY == 0:
+                pipeline.tick()  # a file is flushed and ended when it is due, however much there is to do
         for reason, drop in drops.items():
             self._writer.drop(reason, drop.key, drop.payload_bytes, drop.at_ns, count=drop.count)
-        self._writer.tick()
+        pipeline.tick()
         self._moved_at = time.monotonic()
-        self._snapshot("recording" if self._writer.recording or not self._writer.problem else "paused")
+        if self._writer.recording or not self._writer.problem:
+            self._snapshot("recording" if self._writer.recording or self._pipeline.gate.always else "waiting")
+        else:
+            self._snapshot("paused")
 
     def _snapshot(self, state: str, problem: str = "") -> None:
         writer = self._writer
@@ -205,6 +241,12 @@ class Recorder:
             messages=writer.messages,
             file_bytes=writer.file_bytes,
             dropped=dict(writer.dropped),
+            not_heard=dict(writer.not_heard),
+            redacted=self._pipeline.redactor.count,
+            incidents=self._pipeline.gate.incidents,
+            last_incident=self._pipeline.gate.last,
+            held=self._pipeline.gate.held,
+            removed=writer.removed,
         )
 
     @property
@@ -238,6 +280,7 @@ async def run_recorder(
     stop: asyncio.Event,
     *,
     alive: Callable[[RecorderStatus], None] | None = None,
+    about: About | None = None,
 ) -> None:
     """Record a fleet until `stop` is set, in a process of its own (`swiftbot record`).
 
@@ -248,6 +291,7 @@ async def run_recorder(
         stop: Ends it; what waits is written and the file finished.
         alive: Called when it has begun and then every `status_s` while the writer thread moves: a hook for the
             service manager's readiness and watchdog.
+        about: What the log is to be understood by, and must not hold.
 
     Raises:
         ConfigError: a setting cannot work.
@@ -257,7 +301,7 @@ async def run_recorder(
     config.check()
     session = await Session.open(plane_config, fleet)
     try:
-        recorder = Recorder(session, config)
+        recorder = Recorder(session, config, about=about)
         await recorder.start()
         try:
             while not stop.is_set() and not recorder.failed:

@@ -9,6 +9,7 @@ or it is reported as damage, and what follows is still read.
 import io
 import os
 import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -17,7 +18,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 
 from appliance.errors import NotFoundError, RecordError
@@ -29,7 +30,8 @@ _FRAME = struct.Struct("<BQ")
 BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, EOFError, RuntimeError, MemoryError, OverflowError)
 """What the decoders raise on bad bytes (lz4 raises RuntimeError, checksums ValueError)."""
 
-Record = Header | Schema | Channel | Message | Metadata
+Record = Header | Schema | Channel | Message | Metadata | Attachment
+_READ = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.ATTACHMENT)
 
 
 class RecordStream:
@@ -52,6 +54,7 @@ class RecordStream:
         self.schemas: dict[int, Schema] = {}
         self._messages = 0
         self._claimed = 0
+        self._chunks = self._indexed = 0
         self._ends_with_magic = False
 
     def __iter__(self) -> Iterator[Record]:
@@ -82,13 +85,17 @@ class RecordStream:
                 elif self._messages < self._claimed:
                     # A damaged opcode makes a chunk look like something to skip: only the count tells.
                     self.problems.append(f"{self._claimed - self._messages} of {self._claimed} messages are missing")
+                elif self._chunks < self._indexed:
+                    self.problems.append(f"{self._indexed - self._chunks} of {self._indexed} chunks are missing")
                 return
             if opcode == Opcode.STATISTICS and length >= 8:
                 (self._claimed,) = struct.unpack_from("<Q", stream.read(length))
                 continue
+            self._chunks += opcode == Opcode.CHUNK
+            self._indexed += opcode == Opcode.CHUNK_INDEX
             if opcode == Opcode.CHUNK:
                 yield from self._chunk(stream.read(length), start)
-            elif opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA):
+            elif opcode in _READ and length <= CHUNK_LIMIT:
                 record = self._record(opcode, stream.read(length), start)
                 if record is not None:
                     yield record
@@ -115,6 +122,8 @@ class RecordStream:
                 channel = Channel.read(stream)
                 self.channels[channel.id] = channel
                 return channel
+            if opcode == Opcode.ATTACHMENT:
+                return _attachment(body)
             return Header.read(stream) if opcode == Opcode.HEADER else Metadata.read(stream)
         except BROKEN as error:
             self.problems.append(f"record at byte {start} is damaged ({_why(error)})")
@@ -159,6 +168,14 @@ def _empty_message(body: bytes) -> Message:
     """Read a message without payload: the library takes reading nothing for the end of the file."""
     channel, sequence, log_time, publish_time = struct.unpack("<HIQQ", body)
     return Message(channel_id=channel, log_time=log_time, data=b"", publish_time=publish_time, sequence=sequence)
+
+
+def _attachment(body: bytes) -> Attachment:
+    """Read an attachment, checked against its checksum (0: it has none)."""
+    (claimed,) = struct.unpack_from("<I", body, len(body) - 4)
+    if claimed and zlib.crc32(memoryview(body)[:-4]) != claimed:
+        raise ValueError("an attachment's checksum does not match")
+    return Attachment.read(ReadDataStream(io.BytesIO(body)))
 
 
 def _why(error: BaseException) -> str:

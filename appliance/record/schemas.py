@@ -12,83 +12,27 @@ import msgspec
 from msgspec import Struct
 
 from appliance.model import (
+    Act,
     ContainerInfo,
+    Enquiry,
     GatewayStatus,
+    Lease,
+    Lifted,
     LogLine,
     Notice,
     RobotCommand,
     RobotInfo,
     RunEvent,
+    SoftStop,
     TaskRecord,
     TaskRequest,
 )
 from appliance.plane.keys import Keys
 from appliance.record.expressions import compile_expression
-from appliance.record.facts import Deletion, Gap, LoggedMessage, RecorderStatus
+from appliance.record.facts import Deletion, Gap, Incident, RecorderStatus, Trigger
+from appliance.record.foxglove import IMAGE_KIND, LOCATION_KIND, LOG_KIND, POSE_KIND, TRANSFORM_KIND, ChannelKind
 
 JsonSchema = dict[str, Any]
-
-_TIME: JsonSchema = {
-    "type": "object",
-    "title": "time",
-    "properties": {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0}},
-}
-
-COMPRESSED_IMAGE: JsonSchema = {
-    "title": "foxglove.CompressedImage",
-    "description": "A compressed image",
-    "type": "object",
-    "properties": {
-        "timestamp": _TIME,
-        "frame_id": {"type": "string"},
-        "data": {"type": "string", "contentEncoding": "base64"},
-        "format": {"type": "string"},
-    },
-}
-"""Well-known schema of the image panel."""
-
-FOXGLOVE_LOG: JsonSchema = {
-    "title": "foxglove.Log",
-    "description": "A log message",
-    "type": "object",
-    "properties": {
-        "timestamp": _TIME,
-        "level": {"type": "integer", "description": "0 unknown, 1 debug, 2 info, 3 warning, 4 error, 5 fatal"},
-        "message": {"type": "string"},
-        "name": {"type": "string"},
-        "file": {"type": "string"},
-        "line": {"type": "integer", "minimum": 0},
-    },
-}
-"""Well-known schema of the log panel."""
-
-_LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "exception": 4, "critical": 5, "fatal": 5}
-
-
-class ChannelKind(Struct, frozen=True):
-    """How messages of a key are described in a log: schema name and text (both empty: none), message encoding."""
-
-    schema: str
-    schema_text: bytes
-    encoding: str
-
-
-class FoxgloveTime(Struct, frozen=True):
-    """A time as Foxglove's schemas have it."""
-
-    sec: int
-    nsec: int
-
-
-class FoxgloveLog(Struct, frozen=True):
-    """`foxglove.Log`: made by the recorder from log lines and notices, beside the originals."""
-
-    timestamp: FoxgloveTime
-    level: int
-    message: str
-    name: str
-    file: str = ""
-    line: int = 0
 
 
 def flat_schema(kind: type[Struct]) -> JsonSchema:
@@ -123,10 +67,15 @@ def struct_kind(kind: type[Struct]) -> ChannelKind:
     return ChannelKind(f"swiftbot.{kind.__name__}", msgspec.json.encode(flat_schema(kind)), "json")
 
 
-IMAGE_KIND = ChannelKind("foxglove.CompressedImage", msgspec.json.encode(COMPRESSED_IMAGE), "json")
-LOG_KIND = ChannelKind("foxglove.Log", msgspec.json.encode(FOXGLOVE_LOG), "json")
-MAVLINK_KIND = ChannelKind("", b"", "mavlink")
+MAVLINK_DIALECT = "ardupilotmega"
+"""What frames are read with: it has all messages of `common`, and those of ArduPilot's vehicles beside."""
 PLAIN_JSON = ChannelKind("", b"", "json")
+
+
+def mavlink_kind(direction: str) -> ChannelKind:
+    """Return how raw frames of one direction are logged: MCAP has no schema for them, so the metadata says it."""
+    told = {"dialect": MAVLINK_DIALECT, "direction": direction if direction != "*" else "other"}
+    return ChannelKind("", b"", "mavlink", tuple(told.items()))
 
 
 def _outline(name: str, **properties: str) -> ChannelKind:
@@ -169,17 +118,31 @@ class KeySchemas:
             (keys.robot(), struct_kind(RobotInfo)),
             (keys.commanded(), struct_kind(RobotCommand)),
             (keys.camera(), IMAGE_KIND),
-            (keys.mavlink(), MAVLINK_KIND),
+            *(
+                (expression, mavlink_kind(each))
+                for each in ("rx", "tx", "*")
+                for expression in (keys.mavlink(direction=each), keys.link_frames(direction=each))
+            ),
+            (keys.act(), struct_kind(Act)),
+            (keys.soft_stop(), struct_kind(SoftStop)),
+            (keys.lifted(), struct_kind(Lifted)),
+            (keys.lease(), struct_kind(Lease)),
+            (keys.enquiry(), struct_kind(Enquiry)),
+            *((keys.link_frames(direction=each), mavlink_kind(each)) for each in ("rx", "tx", "*")),
             (keys.intake(), struct_kind(TaskRequest)),
             (keys.notice(), struct_kind(Notice)),
             (keys.recorder_status(), struct_kind(RecorderStatus)),
+            (keys.recorder_trigger(), struct_kind(Trigger)),
+            (keys.recorder_incident("*"), struct_kind(Incident)),
+            (keys.decided(), _outline("Decided", task="string", subtask="string")),
             (keys.recorder_gap("*"), struct_kind(Gap)),
             (keys.recorder_deleted("*"), struct_kind(Deletion)),
             (keys.recorder_log("*"), LOG_KIND),
+            (keys.recorder_view("*", "*", "pose"), POSE_KIND),
+            (keys.recorder_view("*", "*", "transform"), TRANSFORM_KIND),
+            (keys.recorder_view("*", "*", "location"), LOCATION_KIND),
         ]
         self._typed = [(compile_expression(expression), kind) for expression, kind in typed]
-        self._lines = compile_expression(keys.log())
-        self._notices = compile_expression(keys.notice())
 
     def kind_of(self, key: str, encoding: str) -> ChannelKind:
         """Return how messages of `key`, put with Zenoh encoding `encoding`, are described in a log."""
@@ -191,26 +154,6 @@ class KeySchemas:
         if _is_json(encoding):
             return PLAIN_JSON
         return ChannelKind("", b"", encoding.partition(";")[0] or "application/octet-stream")
-
-    def is_news(self, key: str) -> bool:
-        """Whether messages of `key` also go to Foxglove's log panel."""
-        return bool(self._lines.fullmatch(key) or self._notices.fullmatch(key))
-
-    def as_foxglove_log(self, message: LoggedMessage) -> bytes | None:
-        """Return a log line or notice as `foxglove.Log` JSON; None when its payload is malformed."""
-        try:
-            if self._notices.fullmatch(message.key):
-                notice = msgspec.json.decode(message.payload, type=Notice)
-                at_ns, level, text, name = notice.at_ns, 2, f"to {notice.to}: {notice.text}", notice.gateway
-            else:
-                line = msgspec.json.decode(message.payload, type=LogLine)
-                fields = " ".join(f"{key}={value}" for key, value in line.fields.items())
-                at_ns, name = line.at_ns, line.source
-                level, text = _LEVELS.get(line.level.lower(), 0), f"{line.event} {fields}".rstrip()
-        except msgspec.MsgspecError:
-            return None
-        seconds, nanos = divmod(max(0, at_ns or message.at_ns), 1_000_000_000)
-        return msgspec.json.encode(FoxgloveLog(FoxgloveTime(seconds, nanos), level, text, name))
 
 
 def _is_json(encoding: str) -> bool:

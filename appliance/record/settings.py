@@ -17,6 +17,20 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     directory: str = "/var/lib/swiftbot/log"
     """Where the log files go; made when absent."""
+    mode: str = "all"
+    """`all`: everything is written. `incidents`: the last `before_s` seconds are held in memory and written when
+    something goes wrong (a task fails, a failsafe, a soft stop, `swiftbot log trigger`), with what follows. For a site
+    where nothing happens on most days and disks are small; what a power cut takes then is what waited in memory."""
+    before_s: float = 30.0
+    """Of `incidents`: how far back the log goes. A failed attempt and its repetitions take half a minute."""
+    after_s: float = 30.0
+    """Of `incidents`: how long it goes on after the last incident."""
+    ring_bytes: int = 64 * 2**20
+    """Of `incidents`: what the messages held may take; the oldest go first. 30 s of a busy fleet with cameras."""
+    device_name: str = ""
+    """By which Foxglove files recordings; empty: fleet and recorder's name."""
+    device_id: str = ""
+    """Foxglove's own id of the device (`dev_...`), where it has been given one; empty: the name alone is told."""
     name: str = "recorder"
     """The recorder's name on the network and in file names; different for each recorder of a fleet."""
     chunk_bytes: int = 64 * 1024
@@ -38,8 +52,9 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     total_bytes: int = 8 * 2**30
     """What this recorder's files may take together; at each new file the oldest go, pinned ones never. 0: no limit.
     A local fleet of three gateways and two robots at work writes 17 to 29 MB an hour: this is some twelve days."""
-    queue_messages: int = 20_000
-    """Messages waiting for the writer thread; more are dropped, counted and written down as a gap."""
+    queue_messages: int = 60_000
+    """Messages waiting for the writer thread; more are dropped, counted and written down as a gap. A disk that takes a
+    second to sync is no loss then, at all that a fleet can say."""
     queue_bytes: int = 64 * 2**20
     """The same bound in payload bytes: pictures are larger than telemetry."""
     message_bytes: int = 16 * 2**20
@@ -55,14 +70,24 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise ConfigError(error.message, remedy=error.remedy) from error
         if self.compression not in ("zstd", "lz4", "none"):
             raise ConfigError(f"record.compression is {self.compression!r}", remedy="choose one of: zstd, lz4, none")
-        for key in ("chunk_bytes", "rotate_bytes", "queue_messages", "queue_bytes", "message_bytes", "max_channels"):
+        for key in (
+            "chunk_bytes",
+            "rotate_bytes",
+            "queue_messages",
+            "queue_bytes",
+            "message_bytes",
+            "max_channels",
+            "ring_bytes",
+        ):
             if getattr(self, key) < 1:
                 raise ConfigError(f"record.{key} is {getattr(self, key)}", remedy="give a number above 0")
         if self.max_channels > 60_000:
             raise ConfigError(
                 f"record.max_channels is {self.max_channels}", remedy="give at most 60000: MCAP numbers 65,535"
             )
-        for key in ("flush_s", "rotate_s", "status_s"):
+        if self.mode not in ("all", "incidents"):
+            raise ConfigError(f"record.mode is {self.mode!r}", remedy="choose one of: all, incidents")
+        for key in ("flush_s", "rotate_s", "status_s", "before_s", "after_s"):
             if not getattr(self, key) > 0:
                 raise ConfigError(f"record.{key} is {getattr(self, key)}", remedy="give a time above 0 seconds")
         if self.total_bytes and self.total_bytes < 2 * self.rotate_bytes:

@@ -1,4 +1,4 @@
-"""Messages into MCAP files: channels, flushing, rotation, and what happens when the disk is full.
+"""Messages into MCAP files: rotation, gaps, and what happens when the disk is full.
 
 Synchronous and without threads or network, with clock, free space and file passed in, so that every way a disk
 can fail is tried in a test. It never raises for the disk's sake: it pauses, says why in `problem`, counts what
@@ -10,19 +10,19 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any, Protocol, cast
 
-import msgspec
 import structlog
-from mcap.writer import CompressionType, Writer
-from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.errors import RecordError
+from appliance.model import Site
 from appliance.plane.keys import Keys
 from appliance.record.budget import make_room
-from appliance.record.facts import Deletion, Gap, LoggedMessage
+from appliance.record.facts import Gap, Incident, LoggedMessage
+from appliance.record.foxglove import Foxglove
 from appliance.record.logfile import LogFile, free_bytes
-from appliance.record.schemas import ChannelKind, KeySchemas
+from appliance.record.openlog import Attached, File, OpenLog
+from appliance.record.schemas import KeySchemas
 from appliance.record.settings import RecordConfig
 
 log = structlog.get_logger(__name__)
@@ -31,41 +31,15 @@ VERSION = "0.1.0"
 """Version of the recorder written into each file's metadata."""
 METADATA = "swiftbot"
 """Name of that metadata record."""
-COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-_MAX_NS = 2**63 - 1
+FOXGLOVE = "foxglove"
+"""Name of the metadata record by which Foxglove knows whose recording it is (docs.foxglove.dev, "Manage data")."""
+NOT_HEARD = "not heard"
+"""Reason of a gap that is not the recorder's doing."""
+MOST_PLANS = 200
+"""Attachments that wait for the next flush."""
 _FIRST_RETRY_S = 1.0
 _LAST_RETRY_S = 30.0
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-class File(Protocol):
-    """What the writer needs of a file; `LogFile`, or a failing one in tests."""
-
-    path: Path
-
-    def write(self, data: bytes) -> int: ...  # noqa: D102 - see LogFile
-    def tell(self) -> int: ...  # noqa: D102
-    def flush(self) -> None: ...  # noqa: D102
-    def sync(self) -> None: ...  # noqa: D102
-    def close(self) -> None: ...  # noqa: D102
-    def abandon(self) -> bool: ...  # noqa: D102
-
-
-class _Open(Struct, kw_only=True):
-    """A file being written. Channel ids by (topic, Zenoh encoding)."""
-
-    file: File
-    mcap: Writer
-    since: float
-    channels: dict[tuple[str, str], int]
-    schemas: dict[str, int]
-    whole: int = 0
-    """Size at the last whole chunk."""
-    unflushed: int = 0
-    """Messages that are not in a whole chunk yet: what a failing write loses."""
-    gaps: list[Gap]
-    """Gaps among them."""
-    synced: bool = True
 
 
 class LogWriter:
@@ -74,6 +48,8 @@ class LogWriter:
     Args:
         config: Sizes and times.
         fleet: Whose messages; goes into names and metadata.
+        site: Where the fleet is on the globe, for locations.
+        attached: What each file begins with: configuration, versions.
         clock: Monotonic seconds.
         wall: Unix nanoseconds.
         free: Free bytes of a folder's file system.
@@ -85,6 +61,8 @@ class LogWriter:
         config: RecordConfig,
         *,
         fleet: str,
+        site: Site | None = None,
+        attached: tuple[Attached, ...] = (),
         clock: Callable[[], float] = time.monotonic,
         wall: Callable[[], int] = time.time_ns,
         free: Callable[[Path], int] = free_bytes,
@@ -97,20 +75,23 @@ class LogWriter:
         self.messages = 0
         self.files: list[Path] = []
         self.dropped: dict[str, int] = {}
+        self.not_heard: dict[str, int] = {}
         self.removed = 0
         """Old files removed to stay within `total_bytes`."""
         self._prefix = f"{fleet}-{config.name}-"
-        self._keys = Keys(fleet)
-        self._schemas = KeySchemas(self._keys)
+        keys = Keys(fleet)
+        self._schemas = KeySchemas(keys)
+        self._foxglove = Foxglove(keys, config.name, site=site)
+        self._attached = attached
         self._clock, self._wall, self._free, self._open_file = clock, wall, free, open_file
-        self._current: _Open | None = None
-        self._gaps: dict[str, Gap] = {}
+        self._current: OpenLog | None = None
+        self._gaps: dict[tuple[str, str], Gap] = {}
+        self._waiting: list[Attached] = []
         self._retry_at = float("-inf")
         self._retry_s = _FIRST_RETRY_S
         self._reason = "disk full"
         self._flushed_at = clock()
         self._sequence = 0
-        self._news_topic = self._keys.recorder_log(config.name)
 
     @property
     def recording(self) -> bool:
@@ -148,14 +129,13 @@ class LogWriter:
         if len(message.payload) > self.config.message_bytes:
             self.drop("too large", message.key, len(message.payload), message.at_ns)
             return False
-        current = self._ready()
+        current = self._current or self._ready()
         if current is None:
             self.drop(self._reason, message.key, len(message.payload), message.at_ns)
             return False
         self.messages += 1
-        current.unflushed += 1  # until it is in a whole chunk; counted as lost when a write fails before that
         try:
-            self._add(current, message)
+            current.add(message, now_ns=self._wall())
         except OSError as error:
             self._fail(error)
             return False
@@ -166,16 +146,40 @@ class LogWriter:
         self.dropped[reason] = self.dropped.get(reason, 0) + count
         self._note(Gap(reason=reason, dropped=count, payload_bytes=size, since_ns=at_ns, until_ns=at_ns, last_key=key))
 
+    def miss(self, source: str, count: int, key: str, at_ns: int) -> None:
+        """Count messages that never came here; told in the log as those that were dropped are."""
+        self.not_heard[source] = self.not_heard.get(source, 0) + count
+        gap = Gap(reason=NOT_HEARD, dropped=count, since_ns=at_ns, until_ns=at_ns, last_key=key, source=source)
+        self._note(gap)
+
+    def mark(self, incident: Incident) -> None:
+        """Write an incident down, and have what leads up to it on the disk soon."""
+        current = self._current or self._ready()
+        if current is None:
+            return
+        try:
+            current.add_incident(incident, now_ns=self._wall())
+        except OSError as error:
+            self._fail(error)
+
+    def attach(self, attached: Attached) -> None:
+        """Add a file to the log with the next flush."""
+        if len(self._waiting) < MOST_PLANS and len(attached.data) <= self.config.message_bytes:
+            self._waiting.append(attached)
+
     def tick(self) -> None:
         """Flush, rotate and look after free space, each when it is due; to be called a few times a second."""
         now = self._clock()
-        current = self._ready()
+        # With `incidents` a file is begun by the first message only: gaps wait, one for each reason and source.
+        current = self._ready() if self.config.mode == "all" or self.problem else self._current
         if current is None:
             return
         try:
             self._write_gaps(current)
             if now - self._flushed_at >= self.config.flush_s:
-                self._flush(current)
+                self._flushed_at = now
+                if current.flush(self._take_attached(), now_ns=self._wall(), sync=self.config.fsync):
+                    self._retry_s = _FIRST_RETRY_S
                 if self._free(self.config.folder) < self.config.free_bytes:
                     self._pause_for_space()
                     return
@@ -185,12 +189,12 @@ class LogWriter:
         if (
             current.file.tell() >= self.config.rotate_bytes
             or now - current.since >= self.config.rotate_s
-            or len(current.channels) >= self.config.max_channels
+            or current.channels >= self.config.max_channels
         ):
             self._finish()
 
     def close(self) -> None:
-        """Finish the file, with its summary, as far as the disk allows."""
+        """Finish the file, with its summary, as far as the disk allows; the next message begins another."""
         current = self._current
         if current is None and self._gaps:
             self._retry_at = float("-inf")
@@ -206,22 +210,20 @@ class LogWriter:
     # --- inside ------------------------------------------------------------------------------------------
 
     def _note(self, gap: Gap) -> None:
-        """Add a gap to those that wait to be written; one per reason."""
-        old = self._gaps.get(gap.reason)
-        self._gaps[gap.reason] = (
-            gap
-            if old is None
-            else Gap(
-                reason=gap.reason,
+        """Add a gap to those that wait to be written; one per reason and source."""
+        old = self._gaps.get((gap.reason, gap.source))
+        if old is not None:
+            gap = replace(
+                gap,
                 dropped=old.dropped + gap.dropped,
                 payload_bytes=old.payload_bytes + gap.payload_bytes,
                 since_ns=min(old.since_ns, gap.since_ns),
                 until_ns=max(old.until_ns, gap.until_ns),
                 last_key=gap.last_key or old.last_key,
             )
-        )
+        self._gaps[gap.reason, gap.source] = gap
 
-    def _ready(self) -> _Open | None:
+    def _ready(self) -> OpenLog | None:
         """Return the file to write in, opening one when it is time; None while there is no space."""
         if self._current is not None:
             return self._current
@@ -251,7 +253,7 @@ class LogWriter:
         self.problem = ""
         return self._current
 
-    def _start(self, now: float) -> _Open:
+    def _start(self, now: float) -> OpenLog:
         if self.config.total_bytes:
             # Room for the file that begins now, too.
             room = self.config.total_bytes - self.config.rotate_bytes
@@ -266,107 +268,41 @@ class LogWriter:
                 break
             except FileExistsError:
                 continue  # another start within this second
+        current = OpenLog(file, self.config, self._schemas, self._foxglove, since=now)
+        about = {
+            "fleet": self.fleet,
+            "version": VERSION,
+            "recorder": self.config.name,
+            "start": stamp.isoformat(),
+            "start_ns": str(started_ns),
+            "sequence": str(self._sequence),
+        }
+        device = {"deviceName": self.config.device_name or f"{self.fleet}-{self.config.name}"}
+        if self.config.device_id:
+            device["deviceId"] = self.config.device_id
         try:
-            mcap = Writer(
-                cast("IO[Any]", file),
-                chunk_size=self.config.chunk_bytes,
-                compression=COMPRESSIONS[self.config.compression],
-            )
-            mcap.start(profile="", library=f"swiftbot {VERSION}")
-            mcap.add_metadata(
-                METADATA,
-                {
-                    "fleet": self.fleet,
-                    "version": VERSION,
-                    "recorder": self.config.name,
-                    "start": stamp.isoformat(),
-                    "start_ns": str(started_ns),
-                    "sequence": str(self._sequence),
-                },
-            )
-            mcap.flush()
+            current.start(f"swiftbot {VERSION}", {METADATA: about, FOXGLOVE: device}, self._attached)
         except OSError:
             file.abandon()
             raise
         self.files.append(file.path)
-        return _Open(file=file, mcap=mcap, since=now, channels={}, schemas={}, gaps=[], whole=file.tell())
+        return current
 
-    def _add(self, current: _Open, message: LoggedMessage) -> None:
-        at_ns = message.at_ns if 0 < message.at_ns <= _MAX_NS else self._wall()
-        if message.deleted:
-            deletion = msgspec.json.encode(Deletion(key=message.key, at_ns=at_ns))
-            topic = self._keys.recorder_deleted(self.config.name)
-            self._put(current, topic, "application/json", at_ns, deletion)
-            return
-        self._put(current, message.key, message.encoding, at_ns, message.payload)
-        if self._schemas.is_news(message.key):
-            news = self._schemas.as_foxglove_log(message)
-            if news is not None:
-                self._put(current, self._news_topic, "application/json", at_ns, news)
+    def _write_gaps(self, current: OpenLog) -> None:
+        """Write down what is missing. A gap leaves the books once it is handed to the file."""
+        for which in list(self._gaps):
+            current.add_gap(self._gaps.pop(which), now_ns=self._wall())
 
-    def _put(self, current: _Open, topic: str, encoding: str, at_ns: int, payload: bytes) -> None:
-        channel = current.channels.get((topic, encoding))
-        if channel is None:
-            channel = self._register(current, topic, encoding)
-        current.mcap.add_message(channel, log_time=at_ns, data=payload, publish_time=at_ns)
-        self._settle(current, unflushed=0)
-
-    def _settle(self, current: _Open, *, unflushed: int) -> None:
-        """If the writer has just written a chunk, all before it is whole: a later failure is cut back to here."""
-        if current.file.tell() == current.whole:
-            return
-        current.file.flush()
-        current.whole = current.file.tell()
-        current.unflushed = unflushed
-        current.gaps.clear()
-        current.synced = False
-
-    def _register(self, current: _Open, topic: str, encoding: str) -> int:
-        kind: ChannelKind = self._schemas.kind_of(topic, encoding)
-        schema = 0
-        if kind.schema:
-            schema = current.schemas.get(kind.schema, 0)
-            if not schema:
-                schema = current.mcap.register_schema(kind.schema, "jsonschema", kind.schema_text)
-                current.schemas[kind.schema] = schema
-        # The metadata lets the reader give back Zenoh's encoding and leave out what the recorder made itself.
-        metadata = {"encoding": encoding} | ({"derived": "true"} if topic == self._news_topic else {})
-        channel = current.mcap.register_channel(topic, kind.encoding, schema, metadata)
-        current.channels[topic, encoding] = channel
-        self._settle(current, unflushed=min(1, current.unflushed))  # the message itself is yet to be added
-        return channel
-
-    def _write_gaps(self, current: _Open) -> None:
-        """Write down what was dropped. A reason leaves the books once its gap is handed to the file."""
-        for reason in list(self._gaps):
-            gap = self._gaps.pop(reason)
-            current.gaps.append(gap)  # comes back into the books when the file fails before it is whole
-            at_ns = gap.until_ns if 0 < gap.until_ns <= _MAX_NS else self._wall()
-            topic = self._keys.recorder_gap(self.config.name)
-            self._put(current, topic, "application/json", at_ns, msgspec.json.encode(gap))
-
-    def _flush(self, current: _Open) -> None:
-        self._flushed_at = self._clock()
-        if current.unflushed or current.gaps:
-            current.mcap.flush()
-            self._settle(current, unflushed=0)
-        if not current.synced:
-            if self.config.fsync:
-                current.file.sync()
-            current.synced = True
-            self._retry_s = _FIRST_RETRY_S
+    def _take_attached(self) -> tuple[Attached, ...]:
+        out, self._waiting = tuple(self._waiting), []
+        return out
 
     def _finish(self) -> None:
         current, self._current = self._current, None
         if current is None:
             return
         try:
-            current.mcap.flush()
-            self._settle(current, unflushed=0)
-            current.mcap.finish()
-            if self.config.fsync:
-                current.file.sync()
-            current.file.close()
+            current.finish(self._take_attached(), now_ns=self._wall(), sync=self.config.fsync)
         except OSError as error:
             self._current = current
             self._fail(error)

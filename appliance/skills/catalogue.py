@@ -54,6 +54,8 @@ class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     type: Literal["string", "number", "integer", "array"]
     required: bool
     description: str = ""
+    usual: float | Annotated[str, Meta(min_length=1, max_length=60)] | None = None
+    """What its handler takes where a plan says nothing; None: nothing fixed. The safety policy looks at it."""
 
 
 class Alternative(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -113,6 +115,8 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Longest that its handler goes without a sign of life: a run that is silent for longer is stuck. 0: not said."""
     speculate: bool = False
     """Whether a run that takes much longer than others may be left for a new attempt elsewhere."""
+    danger: Annotated[str, Meta(max_length=120)] = ""
+    """Why a person should look at a plan before this is done; empty: it is harmless. See `tasks.approval`."""
     checkpoints: bool = False
     """Whether its handler saves a checkpoint when `ctx.checkpoint_due()` says so: worth waiting for before a move."""
     moves: Literal["", "anytime", "between commands", "never"] = ""

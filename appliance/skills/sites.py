@@ -13,7 +13,8 @@ from typing import Any, cast
 import msgspec
 
 from appliance.errors import ConfigError
-from appliance.model import Box, Place, Site, SiteObject
+from appliance.model import Box, Device, Door, Person, Place, Site, SiteObject
+from appliance.model.geo import inside
 from appliance.skills.catalogue import SKILLS, convert
 
 SITES = SKILLS / "sites"
@@ -51,13 +52,25 @@ def plain_name(name: str) -> str:
     return " ".join(word for word in name.lower().replace("_", " ").split() if word not in ("the", "a", "an"))
 
 
+_LISTS: tuple[tuple[str, type[msgspec.Struct]], ...] = (
+    ("obstacles", Box),
+    ("forbidden", Box),
+    ("objects", SiteObject),
+    ("doors", Door),
+    ("devices", Device),
+    ("people", Person),
+)
+
+
 def _check_keys(file: Path, table: dict[str, Any]) -> None:
     """Refuse keys that no struct has; the structs themselves are lenient, for the wire's sake."""
     rows: list[tuple[str, Any, type[msgspec.Struct]]] = [("", table, Site)]
     places = table.get("places")
     if isinstance(places, dict):
         rows += [(f"places.{name}.", row, Place) for name, row in cast("dict[str, Any]", places).items()]
-    for key, kind in (("obstacles", Box), ("forbidden", Box), ("objects", SiteObject)):
+    if isinstance(table.get("fence"), dict):
+        rows.append(("fence.", table["fence"], Box))
+    for key, kind in _LISTS:
         many = table.get(key)
         if isinstance(many, list):
             rows += [(f"{key}[{index}].", row, kind) for index, row in enumerate(cast("list[Any]", many))]
@@ -83,7 +96,9 @@ def _check_places(file: Path, site: Site) -> None:
                 raise _wrong(file, f"places.{name}.{axis}", f"{value} is no coordinate")
         if not 0 <= place.z <= site.altitude_limit_m:
             raise _wrong(file, f"places.{name}.z", f"{place.z} m is not between 0 and altitude_limit_m")
-        for box in (*site.obstacles, *site.forbidden):
+        if site.fence is not None and not inside(site.fence, place.x, place.y, 1e-6):
+            raise _wrong(file, f"places.{name}", f"lies outside {site.fence.name!r}, which no robot may leave")
+        for box in (*site.obstacles, *site.forbidden, *site.doors):
             if box.x[0] < place.x < box.x[1] and box.y[0] < place.y < box.y[1]:
                 raise _wrong(file, f"places.{name}", f"lies inside {box.name!r}, where no robot may go")
 
@@ -94,7 +109,13 @@ def _check_things(file: Path, site: Site) -> None:
             raise _wrong(file, key, f"{value} is not more than 0")
     if not (-90 <= site.latitude_deg <= 90 and -180 <= site.longitude_deg <= 180):
         raise _wrong(file, "latitude_deg", f"{site.latitude_deg}, {site.longitude_deg} is nowhere on Earth")
-    for key, boxes in (("obstacles", site.obstacles), ("forbidden", site.forbidden)):
+    fence = () if site.fence is None else (site.fence,)
+    for key, boxes in (
+        ("obstacles", site.obstacles),
+        ("forbidden", site.forbidden),
+        ("doors", site.doors),
+        ("fence", fence),
+    ):
         for index, box in enumerate(boxes):
             for axis, (low, high) in (("x", box.x), ("y", box.y)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -108,6 +129,13 @@ def _check_things(file: Path, site: Site) -> None:
             raise _wrong(file, f"objects[{index}].at", f"there is no place {thing.at!r}")
         if not 0 < thing.size <= 10:
             raise _wrong(file, f"objects[{index}].size", f"{thing.size} m is not a size of 0 to 10 m")
+    for key, each in (*(("devices", each) for each in site.devices), *(("people", each) for each in site.people)):
+        if site.find(each.at) is None:
+            raise _wrong(file, f"{key}.{each.name}.at", f"there is no place {each.at!r}")
+    for key, each in (*(("doors", each) for each in site.doors), *(("devices", each) for each in site.devices)):
+        if each.name in names:
+            raise _wrong(file, f"{key}.{each.name}", "something else has that name")
+        names.add(each.name)
 
 
 def _wrong(file: Path, key: str, what: str) -> ConfigError:

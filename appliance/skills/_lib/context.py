@@ -1,6 +1,7 @@
 """The shape of `ctx`, so that handlers are checked by type; the object itself comes from the runner."""
 
 import mmap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -41,6 +42,10 @@ class Context(Surroundings, Protocol):
 
     def notify(self, to: str, text: str) -> dict[str, Any]:
         """Send a message to a person."""
+        ...
+
+    def ask(self, question: str, choices: Sequence[str] = (), to: str = "operator", timeout_s: float = 240) -> str:
+        """Ask people and return the answer, one of `choices` where there are any."""
         ...
 
     def put_artifact(self, name: str, data: bytes, media_type: str = ...) -> dict[str, Any]:

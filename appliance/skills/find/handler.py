@@ -19,12 +19,17 @@ def run(ctx: Context) -> dict[str, Any]:
     if not colours.wanted(target, ctx.site).sure:
         raise ctx.Fail(f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'")
     speed = moves.speed(ctx)
-    if "area" in ctx.params:
-        moves.go(ctx, [resolve(ctx, params.text(ctx, "area"))], speed_mps=speed, share=0.2)
-    here = moves.state(ctx)
-    spots = [None, *(Spot(f"a view from the {side}", here.x + STEP_M * x, here.y + STEP_M * y) for x, y, side in VIEWS)]
-    views = 0
-    for number, spot in enumerate(spots):
+    saved = ctx.resume or {}
+    if saved:
+        start, begin, views = (float(saved["x"]), float(saved["y"])), int(saved["next"]), int(saved["views"])
+    else:
+        if "area" in ctx.params:
+            moves.go(ctx, [resolve(ctx, params.text(ctx, "area"))], speed_mps=speed, share=0.2)
+        here = moves.state(ctx)
+        start, begin, views = (here.x, here.y), 0, 0
+    x, y = start
+    spots = [None, *(Spot(f"a view from the {side}", x + STEP_M * dx, y + STEP_M * dy) for dx, dy, side in VIEWS)]
+    for number, spot in enumerate(spots[begin:], start=begin):
         if spot is not None:
             if _closed(ctx, spot):
                 # The calls of a view that is left out are made up for, so that later ones keep their numbers.
@@ -45,6 +50,8 @@ def run(ctx: Context) -> dict[str, Any]:
             rows = [{**row, "image": image["artifact"]} for row in rows]
             seen = {"found": True, "target": target, "detections": rows, "count": looking.most_in_one(rows)}
             return {**seen, "image": image, "annotated": [marked], "views": views, "camera": about}
+        # Nothing here: an attempt on another gateway goes on with the next view.
+        ctx.checkpoint({"x": x, "y": y, "next": number + 1, "views": views})
     raise ctx.Fail(f"{target} was not seen from {views} points", "look in another area: name it as `area`")
 
 

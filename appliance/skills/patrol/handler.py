@@ -1,4 +1,7 @@
-"""patrol: round the edge of a mapped area, or along a route of places, for some laps or some time."""
+"""patrol: round the edge of a mapped area, or along a route of places, for some laps or some time.
+
+Each lap is one command and is saved: an attempt on another gateway goes on with the next one.
+"""
 
 import time
 from typing import Any
@@ -19,19 +22,18 @@ def run(ctx: Context) -> dict[str, Any]:
     lasting = params.number(ctx, "duration_s", default=0.0, low=0.0, high=3600.0)
     spots = _round(ctx, name)
     speed = moves.speed(ctx)
-    begun = time.monotonic()
-    result: dict[str, Any] = {}
-    metres = 0.0
-    lap = 0
-    while lap < MAX_LAPS if lasting else lap < laps:
-        share = 1.0 / laps
-        result = moves.go(ctx, [*spots, spots[0]], speed_mps=speed, done=min(1.0, lap * share) * 0.9, share=share * 0.9)
-        metres += result["path_m"]
+    saved = ctx.resume or {}
+    lap, metres, pose = int(saved.get("lap", 0)), float(saved.get("path_m", 0.0)), saved.get("pose")
+    begun = time.monotonic() - float(saved.get("seconds", 0.0))
+    share = 1.0 / laps
+    while lap == 0 or (lap < MAX_LAPS and time.monotonic() - begun < lasting if lasting else lap < laps):
+        done = min(1.0, lap * share) * 0.9
+        result = moves.go(ctx, [*spots, spots[0]], speed_mps=speed, done=done, share=share * 0.9)
+        metres, pose = metres + result["path_m"], result.get("pose")
         lap += 1
+        ctx.checkpoint({"lap": lap, "path_m": metres, "pose": pose, "seconds": time.monotonic() - begun})
         ctx.partial({"area": name, "laps": lap, "path_m": round(metres, 2)})
-        if lasting and time.monotonic() - begun >= lasting:
-            break
-    return {"area": name, "laps": lap, "path_m": round(metres, 2), "pose": result.get("pose")}
+    return {"area": name, "laps": lap, "path_m": round(metres, 2), "pose": pose}
 
 
 def _round(ctx: Context, name: str) -> list[Spot]:

@@ -18,12 +18,19 @@ def run(ctx: Context) -> dict[str, Any]:
     target = params.text(ctx, "target")
     lasting = params.number(ctx, "duration_s", default=USUAL_S, low=0.2, high=MAX_S)
     pieces = max(1, -int(-lasting // PIECE_S))
-    count = 0
-    for piece in range(pieces):
+    saved = ctx.resume or {}
+    count, kept = int(saved.get("frames", 0)), [dict(each) for each in params.rows(saved.get("pieces"))]
+    begin = int(saved.get("next", 0))
+    for each in kept:
+        (ctx.scratch / str(each["name"])).write_bytes(ctx.get_artifact(each))
+    for piece in range(begin, pieces):
         seconds = min(PIECE_S, lasting - piece * PIECE_S)
         ctx.progress(0.9 * piece / pieces, f"recording {target}: {piece * PIECE_S:g} of {lasting:g} s")
         answer = ctx.command("record", timeout_s=60 + seconds, target=target, duration_s=seconds, fps=FPS)
         count += _encode(ctx, piece, answer.get("blobs") or {})
+        if piece + 1 < pieces and ctx.checkpoint_due():
+            kept += _keep(ctx, {str(each["name"]) for each in kept})
+            ctx.checkpoint({"frames": count, "pieces": kept, "next": piece + 1})
     if count == 0:
         raise ctx.Fail(f"{ctx.robot} recorded no frame of {target}", "look at its camera", retryable=True)
     ctx.progress(0.95, f"joining {count} frames")
@@ -49,6 +56,12 @@ def _encode(ctx: Context, piece: int, blobs: dict[str, bytes]) -> int:
     for file in frames:
         file.unlink()
     return len(frames)
+
+
+def _keep(ctx: Context, known: set[str]) -> list[dict[str, Any]]:
+    """Keep the pieces that are not kept yet, for an attempt on another gateway; return references to them."""
+    new = sorted(each for each in ctx.scratch.glob("piece-*.mp4") if each.name not in known)
+    return [ctx.put_artifact(each.name, each.read_bytes(), "video/mp4") for each in new]
 
 
 def _join(ctx: Context) -> None:

@@ -1,0 +1,96 @@
+"""Measurements under outages and faults of the network: tasks with counted effects, histories of records."""
+
+import sys
+
+from appliance.cli.bench.common import GOOD, Network, bench_app, measure, say, tell
+from appliance.cli.common import Json
+
+
+def _faults(named: str) -> tuple[str, ...]:
+    """Return the faults of the network that are named; with any, this process is run again inside a namespace."""
+    from appliance.bench.net.faults import FAULTS
+    from appliance.bench.net.space import enter
+    from appliance.errors import ConfigError
+
+    if not named:
+        return ()
+    faults = FAULTS if named == "all" else tuple(each.strip() for each in named.split(","))
+    if unknown := [each for each in faults if each not in FAULTS]:
+        raise ConfigError(f"there is no fault {unknown[0][:40]!r}", remedy=f"there are: {', '.join(FAULTS)}")
+    enter(sys.argv[1:])
+    return faults
+
+
+@bench_app.command
+def chaos(
+    *,
+    minutes: float = 5.0,
+    tasks: int = 200,
+    gateways: int = 8,
+    every_s: float | None = None,
+    freezes: float = 0.2,
+    network: Network = GOOD,
+    as_json: Json = False,
+) -> int:
+    """Tasks with counted effects on gateways that are killed, stopped and started again: is anything lost or doubled?
+
+    Ends with 1 when a task that was accepted did not end, or an effect is missing or there twice; then the folder
+    with the MCAP log and the ledger is kept and named.
+
+    Args:
+        minutes: How long gateways go down; with faults of the network their times count.
+        tasks: Tasks handed in over that time.
+        gateways: Gateways, each a process.
+        every_s: Mean time between outages, seconds, 0 for none; by default 4, and none with faults of the network.
+        freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
+    """
+    from appliance.bench.chaos.run import Options, run
+
+    named = _faults(network.faults)
+    options = Options(
+        gateways=gateways, tasks=tasks, seconds=minutes * 60, down_at_once=network.down_at_once, freezes=freezes,
+        seed=network.seed, every_s=every_s if every_s is not None else 0.0 if named else 4.0, faults=named,
+        fault_s=network.fault_s, rest_s=network.rest_s, keep=network.keep,
+    )  # fmt: skip
+    result = measure(run(options, progress=say))
+    tell(result, as_json=as_json)
+    return 0 if result["held"] else 1
+
+
+@bench_app.command
+def history(
+    *,
+    seconds: float = 60.0,
+    gateways: int = 5,
+    clients: int = 8,
+    keys: int = 6,
+    quorum: bool = True,
+    every_s: float = 3.0,
+    freezes: float = 0.4,
+    network: Network = GOOD,
+    as_json: Json = False,
+) -> int:
+    """Concurrent compare-and-sets on records while gateways are killed and stopped: was every answer right?
+
+    With a quorum the history of each key is checked for linearizability; without one, that replicas agree in the end
+    and that no acknowledged write is forgotten. Ends with 1 when it is not so; the recorded history is kept and named.
+
+    Args:
+        seconds: How long; with faults of the network their times count.
+        gateways: Gateways, each a process with nothing but its plane.
+        clients: Clients, each linked to one gateway.
+        keys: Keys they share.
+        quorum: Ask for a quorum.
+        every_s: Mean time between outages, seconds; 0 for none.
+        freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
+    """
+    from appliance.bench.history.run import Options, run
+
+    options = Options(
+        seconds=seconds, gateways=gateways, clients=clients, keys=keys, quorum=quorum, every_s=every_s,
+        freezes=freezes, down_at_once=network.down_at_once, faults=_faults(network.faults), fault_s=network.fault_s,
+        rest_s=network.rest_s, seed=network.seed, keep=network.keep,
+    )  # fmt: skip
+    result = measure(run(options, progress=say))
+    tell(result, as_json=as_json)
+    return 0 if result["held"] else 1

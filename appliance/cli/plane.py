@@ -1,0 +1,227 @@
+"""Records of the plane: `swiftbot plane …`."""
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from cyclopts import App, Parameter
+
+from appliance import console
+from appliance.cli.common import HERE, TOOLS, Json, Where, show
+from appliance.errors import ConfigError, NotFoundError, PayloadError
+
+plane_app = App(name="plane", help="Records of the fleet's plane: read, list, compare and set.", group=TOOLS)
+
+Quorum = Annotated[
+    bool, Parameter(negative="", help="As a majority of the key's voters has it (linearizable); needs plane.voters.")
+]
+Force = Annotated[bool, Parameter(negative="", help="Also what gateways write themselves, such as task/….")]
+Expect = Annotated[
+    str, Parameter(help="The version that it must have, as JSON such as '{\"gw-1\": 3}'; by default the present one.")
+]
+
+
+def add_to(app: App) -> None:
+    """Add these commands."""
+    app.command(plane_app)
+
+
+@plane_app.command
+def get(
+    key: str,
+    /,
+    *,
+    quorum: Quorum = False,
+    replica: Annotated[
+        bool, Parameter(negative="", help="From any replica: the fastest answer, which may be behind.")
+    ] = False,
+    raw: Annotated[bool, Parameter(negative="", help="Print the value alone, as it is.")] = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Show a record: its value and version, its owner, and what each replica holds.
+
+    Args:
+        key: Of the record, such as task/t-1f3a.
+    """
+    from appliance.cli.records import place_table
+    from appliance.records import How, Records
+
+    if quorum and replica:
+        raise ConfigError("--quorum and --replica exclude each other", remedy="leave one out")
+    how: How = "quorum" if quorum else "replica" if replica else "owner"
+
+    async def go() -> tuple[Any, Any]:
+        async with Records(where.endpoint()) as records:
+            return await records.read(key, how), await records.place(key)
+
+    record, place = asyncio.run(go())
+    if raw:
+        sys.stdout.buffer.write(record.value)
+        return 0
+    text = _text(record.value)
+    if as_json:
+        value = _value(record.value)
+        told = {"key": key, "read": how, "version": record.version, "value": value, "place": place}
+        show(told | {"agree": place.agree}, as_json=True)
+    else:
+        console.out.print(place_table(record, place, how))
+        console.out.print(text, markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+@plane_app.command
+def put(
+    key: str,
+    value: str = "",
+    /,
+    *,
+    file: Annotated[Path | None, Parameter(help="Take the value from a file.")] = None,
+    stdin: Annotated[bool, Parameter(negative="", help="Take the value from standard input.")] = False,
+    new: Annotated[bool, Parameter(negative="", help="There must be no such record yet.")] = False,
+    expect: Expect = "",
+    quorum: Quorum = False,
+    force: Force = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Write a record, if it has not changed since it was read; prints the new version.
+
+    Args:
+        key: Of the record.
+        value: The new value.
+    """
+    from appliance.records import Records
+
+    if sum((file is not None, stdin, bool(value))) > 1:
+        raise ConfigError("the value is given in several ways", remedy="leave all but one out")
+    if new and expect:
+        raise ConfigError("--new and --expect exclude each other", remedy="leave one out")
+    data = sys.stdin.buffer.read() if stdin else value.encode() if file is None else _read(file)
+
+    async def go() -> Any:
+        async with Records(where.endpoint()) as records:
+            expected = _version(expect) if expect else None
+            if not new and not expect:
+                try:
+                    expected = (await records.read(key, "quorum" if quorum else "owner")).version
+                except NotFoundError:
+                    expected = None
+            return await records.write(key, data, expected=expected, quorum=quorum, force=force)
+
+    _tell_version(key, asyncio.run(go()), as_json=as_json)
+    return 0
+
+
+@plane_app.command
+def rm(
+    key: str,
+    /,
+    *,
+    expect: Expect = "",
+    quorum: Quorum = False,
+    force: Force = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Remove a record, if it has not changed since it was read.
+
+    Args:
+        key: Of the record.
+    """
+    from appliance.records import Records
+
+    async def go() -> Any:
+        async with Records(where.endpoint()) as records:
+            how = "quorum" if quorum else "owner"
+            expected = _version(expect) if expect else (await records.read(key, how)).version
+            return await records.remove(key, expected=expected, quorum=quorum, force=force)
+
+    _tell_version(key, asyncio.run(go()), as_json=as_json)
+    return 0
+
+
+@plane_app.command
+def ls(
+    prefix: str = "",
+    /,
+    *,
+    limit: int = 200,
+    removed: Annotated[bool, Parameter(negative="", help="Also records that were removed and are remembered.")] = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """List records by key: version, owner, who holds copies, and whether these agree.
+
+    Args:
+        prefix: Only keys that begin so.
+        limit: At most so many, 1 to 1,000.
+    """
+    from appliance.cli.records import held_table
+    from appliance.plane.browsing import MOST_LISTED
+    from appliance.records import Records
+
+    if not 1 <= limit <= MOST_LISTED:
+        raise ConfigError(f"--limit {limit}", remedy=f"1 to {MOST_LISTED:,}")
+
+    async def go() -> tuple[Any, Any]:
+        async with Records(where.endpoint()) as records:
+            return await records.held(prefix, limit)
+
+    found, failed = asyncio.run(go())
+    listed = [each for each in found if removed or not each.newest.deleted]
+    told = [msgspec.to_builtins(each) | {"agree": each.agree} for each in listed]
+    show(told, as_json=as_json, table=held_table(listed))
+    for name, error in sorted(failed.items()):
+        console.err.print(f"{name} does not answer: {error}", markup=False)
+    return 3 if failed else 0
+
+
+def _version(text: str) -> dict[str, int]:
+    try:
+        return msgspec.json.decode(text, type=dict[str, int])
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise PayloadError(
+            f"--expect {text[:80]!r} is no version: {error}", remedy="as `plane get` prints it"
+        ) from None
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise NotFoundError(f"{file} cannot be read: {error.strerror}", remedy="name a file that is there") from error
+
+
+def _value(value: bytes) -> Any:
+    """A value as JSON where it is that, else as text, else its bytes, which JSON has as base64."""
+    try:
+        return msgspec.json.decode(value)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        pass
+    try:
+        return value.decode()
+    except UnicodeDecodeError:
+        return value
+
+
+def _text(value: bytes) -> str:
+    """A value for people: indented JSON, text without control characters, or the beginning in hexadecimal."""
+    try:
+        msgspec.json.decode(value)
+        return msgspec.json.format(value, indent=2).decode()
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        pass
+    text = value.decode(errors="replace")
+    if "\ufffd" in text:
+        return f"{value[:64].hex(' ')}{' …' if len(value) > 64 else ''}"
+    return "".join(each if each.isprintable() or each in "\n\t" else "\ufffd" for each in text)
+
+
+def _tell_version(key: str, version: dict[str, int], *, as_json: bool) -> None:
+    if as_json:
+        show({"key": key, "version": version}, as_json=True)
+    else:
+        console.out.print(f"{key} is at {msgspec.json.encode(version).decode()}", markup=False, highlight=False)

@@ -1,0 +1,268 @@
+"""Logs: `swiftbot log …`."""
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
+
+from appliance import console
+from appliance.cli.common import HERE, TOOLS, Json, Where, show
+from appliance.errors import ConfigError, DeadlineError
+
+log_app = App(name="log", help="Look into MCAP logs, mend, replay and check them.", group=TOOLS)
+
+
+def add_to(app: App) -> None:
+    """Add these commands."""
+    app.command(log_app)
+
+
+@log_app.command(name="info")
+def log_info(path: Path, *, verify: Annotated[bool, Parameter(negative="")] = False, as_json: Json = False) -> int:
+    """Say what an MCAP log holds, also one that was cut off.
+
+    Args:
+        path: The log.
+        verify: Read every message, also of a finished file, so that damage in its middle is found.
+        as_json: Print JSON.
+    """
+    from appliance.record.reader import info
+
+    found = info(path, verify=verify)
+    show(found, as_json=as_json, table=console.log_summary(found))
+    return 0
+
+
+Keys = Annotated[tuple[str, ...], Parameter(name="--key", negative="", help="Only keys that match, such as **/task/*.")]
+Without = Annotated[tuple[str, ...], Parameter(negative="", help="Not keys that match.")]
+Since = Annotated[str, Parameter(name="--from", help="Seconds from the start, before the end (-3), or ISO 8601 time.")]
+Until = Annotated[str, Parameter(help="The same; not included.")]
+Out = Annotated[Path, Parameter(name=("--out", "-o"), help="File to write; must not exist.")]
+
+
+def _named(paths: tuple[Path, ...]) -> None:
+    if not paths:
+        raise ConfigError("no log file is named", remedy="name one or more MCAP files")
+
+
+def _select(paths: tuple[Path, ...], keys: tuple[str, ...], without: tuple[str, ...], since: str, until: str) -> Any:
+    from appliance.record.edit import Select, instant, span
+
+    _named(paths)
+    if not since and not until:
+        return Select(keys=keys, without=without)
+    start_ns, end_ns = span(paths)
+    moments = [instant(each, start_ns=start_ns, end_ns=end_ns) if each else None for each in (since, until)]
+    return Select(keys=keys, without=without, since_ns=moments[0], until_ns=moments[1])
+
+
+def _copied(paths: tuple[Path, ...], out: Path, select: Any, *, as_json: bool) -> int:
+    from appliance.record.edit import copy
+
+    with console.err.status("reading") as status:
+        made = copy(paths, out, select, progress=lambda count: status.update(f"{count:,} messages"))
+    show(made, as_json=as_json, table=console.log_summary(made))
+    return 0
+
+
+@log_app.command(name="recover")
+def log_recover(path: Path, out: Path | None = None, *, as_json: Json = False) -> int:
+    """Make a proper file of an unfinished or damaged one; the original is left as it is.
+
+    Args:
+        path: The log of a recorder that was killed, or of a disk that was full or is dying.
+        out: File to write; NAME.recovered.mcap beside it by default.
+    """
+    return _copied((path,), out or path.with_name(f"{path.stem}.recovered.mcap"), None, as_json=as_json)
+
+
+@log_app.command(name="merge")
+def log_merge(paths: tuple[Path, ...], *, out: Out, as_json: Json = False) -> int:
+    """Make one file of several, by time: those of one recorder after rotation, or of several recorders.
+
+    Args:
+        paths: The logs.
+    """
+    return _copied(paths, out, _select(paths, (), (), "", ""), as_json=as_json)
+
+
+@log_app.command(name="trim")
+def log_trim(
+    path: Path,
+    *,
+    out: Out,
+    since: Since = "",
+    until: Until = "",
+    keys: Keys = (),
+    without: Without = (),
+    as_json: Json = False,
+) -> int:
+    """Write a part of a log, by time and key, as a file of its own.
+
+    Args:
+        path: The log.
+    """
+    return _copied((path,), out, _select((path,), keys, without, since, until), as_json=as_json)
+
+
+@log_app.command(name="cat")
+def log_cat(
+    paths: tuple[Path, ...],
+    *,
+    since: Since = "",
+    until: Until = "",
+    keys: Keys = (),
+    without: Without = (),
+    grep: Annotated[str, Parameter(help="Only messages whose text matches this regular expression.")] = "",
+    limit: Annotated[int, Parameter(help="Stop after so many; 0: all.")] = 0,
+    as_json: Json = False,
+) -> int:
+    """Print a log's messages, a line each: time, key, payload; --json prints JSON lines.
+
+    Args:
+        paths: The logs, one after the other.
+    """
+    from appliance.record.cat import cat
+
+    select = _select(paths, keys, without, since, until)
+    try:
+        damaged = cat(paths, select, grep=grep, limit=limit, as_json=as_json, write=sys.stdout.write)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read it has enough (`| head`); nothing more may be written, not even when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    for problem in damaged:
+        console.err.print(f"! {problem}", markup=False)
+    return 1 if damaged else 0
+
+
+@log_app.command(name="pin")
+def log_pin(
+    paths: tuple[Path, ...], *, remove: Annotated[bool, Parameter(negative="")] = False, as_json: Json = False
+) -> int:
+    """Keep logs whatever the recorder's disk budget says (an incident, say); --remove lets them go with the others.
+
+    Args:
+        paths: The logs.
+        remove: Unpin them.
+        as_json: Print JSON.
+    """
+    from appliance.record.budget import pin
+
+    for path in paths:
+        pin(path, pinned=not remove)
+        if not as_json:
+            console.out.print(f"{path} is {'no longer pinned' if remove else 'pinned'}", markup=False)
+    if as_json:
+        show([{"path": str(path), "pinned": not remove} for path in paths], as_json=True)
+    return 0
+
+
+@log_app.command(name="check")
+def log_check(paths: tuple[Path, ...], *, as_json: Json = False) -> int:
+    """Make the decisions of logs again with this version's code and compare; 1 when one comes out differently.
+
+    The task state machine, the retry policy, the choice of gateways and containers, evictions: as far as what they
+    rested on is in the log. Files of one recorder are given in their order.
+
+    Args:
+        paths: The logs.
+        as_json: Print JSON.
+    """
+    from appliance.tasks.check import check
+
+    _named(paths)
+    with console.err.status("reading") as status:
+        report = check(paths, progress=lambda count: status.update(f"{count:,} messages"))
+    show(report, as_json=as_json, table=console.check_summary(report))
+    return 0 if report.same else 1
+
+
+@log_app.command(name="trigger")
+def log_trigger(reason: str, *, by: str = "", wait: float = 5.0, as_json: Json = False, where: Where = HERE) -> int:
+    """Say that what has just happened is worth keeping: recorders mark it, and those set to `incidents` write it.
+
+    Args:
+        reason: What happened, for whoever reads the log.
+        by: Who says so.
+        wait: Seconds to wait for a recorder to confirm it; 0: do not.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+    from appliance.record.asking import trigger
+
+    endpoint = where.endpoint()
+    told = asyncio.run(
+        trigger(endpoint.fleet, endpoint.connect, reason, by=by or os.environ.get("USER", ""), wait_s=wait)
+    )
+    if wait and not told:
+        raise DeadlineError(
+            f"no recorder of {endpoint.fleet} has confirmed it within {wait:g} s",
+            remedy="is one running? `swiftbot record`, or the unit swiftbot-recorder",
+        )
+    lines = [f"{each.id}: {each.state}, incident {each.incidents}, file {each.file or 'none'}" for each in told]
+    show(told, as_json=as_json, table="\n".join(lines))
+    return 0
+
+
+@log_app.command(name="replay")
+def log_replay(
+    paths: tuple[Path, ...],
+    *,
+    onto: Annotated[str, Parameter(name="--as", help="Fleet to play onto; not one at work.")] = "replay",
+    rate: Annotated[float, Parameter(help="Seconds of the log a second; 0: as fast as listeners take it.")] = 1.0,
+    since: Since = "",
+    until: Until = "",
+    keys: Keys = (),
+    without: Without = (),
+    remap: Annotated[
+        tuple[str, ...], Parameter(negative="", help="FROM=TO: keys that begin so are played on others.")
+    ] = (),
+    loop: Annotated[bool, Parameter(negative="", help="Begin again at the end.")] = False,
+    paused: Annotated[bool, Parameter(negative="", help="Begin standing still; needs a terminal.")] = False,
+    orders: Annotated[
+        bool, Parameter(negative="", help="Play requests for tasks too: whoever listens acts on them.")
+    ] = False,
+    clock: Annotated[bool, Parameter(help="Put the log's time on recorder/replay/clock.")] = True,
+    listen: Annotated[
+        tuple[str, ...], Parameter(negative="", help="Endpoint for listeners, where no fleet is to be joined.")
+    ] = (),
+    connect: Annotated[tuple[str, ...], Parameter(negative="", help="Endpoint of a gateway or router to join.")] = (),
+    as_json: Json = False,
+) -> int:
+    """Play logs onto the plane, as the fleet `replay`, so that the terminal UI, Foxglove or a program sees them again.
+
+    In a terminal: space stops and goes on, `.` plays one message, left and right go 5 seconds, + and - change the rate,
+    q ends. Ctrl-C ends it too.
+
+    Args:
+        paths: The logs; several are played together, by time.
+        as_json: Print what came of it as JSON.
+    """
+    from appliance.record.asking import replay
+    from appliance.record.player import PlayOptions, check_rate, parse_remap
+
+    select = _select(paths, keys, without, since, until)
+    options = PlayOptions(
+        select=select,
+        rate=check_rate(rate),
+        loop=loop,
+        paused=paused,
+        remap=parse_remap(remap),
+        orders=orders,
+        clock=clock,
+    )
+    if paused and not sys.stdin.isatty():
+        raise ConfigError("--paused needs a terminal to go on from", remedy="leave it out")
+    endpoints = listen or (() if connect else ("tcp/127.0.0.1:7460",))
+    if endpoints:
+        places = " ".join(f"--connect {each}" for each in endpoints)
+        console.err.print(f"to watch: swiftbot tui --fleet {onto} {places}", markup=False)
+    with console.err.status("reading") as status:
+        played = asyncio.run(replay(paths, options, fleet=onto, listen=endpoints, connect=connect, tell=status.update))
+    show(played, as_json=as_json, table=console.played_text(played))
+    return 0 if played.ended else 130

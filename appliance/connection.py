@@ -1,0 +1,134 @@
+"""A connection to a fleet: asks any gateway, and another one when that is gone. What is asked stands in `client`.
+
+It sits anywhere on the Zenoh network and knows nothing of a gateway's inside.
+"""
+
+import asyncio
+import os
+import time
+from types import TracebackType
+from typing import Self, TypeVar
+
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, NotFoundError, SwiftbotError, UnreachableError
+from appliance.model.steering import MAX_BY
+from appliance.plane.node import PlaneClient
+from appliance.plane.settings import PlaneConfig
+
+R = TypeVar("R", bound=Struct)
+
+PATIENCE_S = 6.0
+"""How long another gateway is looked for when the one that was asked is gone: detection takes a second."""
+
+
+def operator_name() -> str:
+    """Who gives orders from this process: `SWIFTBOT_OPERATOR`, else the user's name."""
+    return (os.environ.get("SWIFTBOT_OPERATOR") or os.environ.get("USER") or f"uid {os.getuid()}")[:MAX_BY]
+
+
+class Endpoint(Struct, frozen=True, kw_only=True):
+    """Where a fleet is: its name, and endpoints of gateways or routers (`tcp/host:port`)."""
+
+    fleet: str
+    connect: tuple[str, ...]
+
+
+class FleetConnection:
+    """A connection to a fleet; use it as an async context manager, or `open` and `close` it.
+
+    Args:
+        endpoint: where the fleet is.
+        operator: signs orders.
+        plane: how to connect, when it is not as a client with plain settings.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, operator: str = "", plane: PlaneConfig | None = None) -> None:
+        self.endpoint = endpoint
+        self._config = plane or PlaneConfig(mode="client", connect=endpoint.connect)
+        self.operator = operator or operator_name()
+        self._plane: PlaneClient | None = None
+
+    async def open(self) -> Self:
+        """Connect, unless that was done; UnreachableError when nothing answers."""
+        if self._plane is not None:
+            return self
+        self._plane = await PlaneClient.open(self._config, fleet=self.endpoint.fleet)
+        return self
+
+    async def close(self) -> None:
+        """Disconnect, unless that was done."""
+        if self._plane is not None:
+            await self._plane.close()
+            self._plane = None
+
+    async def __aenter__(self) -> Self:
+        return await self.open()
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    @property
+    def plane(self) -> PlaneClient:
+        """The open connection."""
+        if self._plane is None:
+            raise UnreachableError("the connection to the fleet is not open")
+        return self._plane
+
+    async def gateway(self) -> str:
+        """Any gateway that is present; UnreachableError when there is none."""
+        return await self.plane.any_gateway()
+
+    async def _ask(
+        self, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0, patience_s: float = PATIENCE_S
+    ) -> R:
+        """Ask any gateway, and another one when it is gone or silent: every verb used here may be repeated."""
+        give_up = time.monotonic() + patience_s
+        silent: set[str] = set()
+        while True:
+            gateway = await self.plane.any_gateway(avoid=silent)
+            try:
+                return await self.plane.rpc.call(gateway, verb, request, reply, timeout_s=timeout_s)
+            except UnreachableError:
+                if time.monotonic() > give_up:
+                    raise
+                await asyncio.sleep(0.1)
+            except DeadlineError:
+                # It may be frozen, which is only noticed when its lease ends.
+                silent.add(gateway)
+                if time.monotonic() > give_up or silent >= self.plane.members():
+                    raise
+
+    async def _known(self, gateway: str) -> None:
+        """Raise when there is no such gateway, or none at all."""
+        await self.gateway()
+        if gateway and gateway not in self.plane.members():
+            known = ", ".join(sorted(self.plane.members()))
+            raise NotFoundError(f"no gateway {gateway[:60]!r} is there", remedy=f"there are: {known}")
+
+    async def _each(
+        self, gateway: str, verb: str, request: Struct, reply: type[R]
+    ) -> tuple[dict[str, R], dict[str, SwiftbotError]]:
+        """Ask one gateway, or all; what they answered, and why some did not."""
+        names = [gateway] if gateway else sorted(self.plane.members())
+        calls = (self.plane.rpc.call(name, verb, request, reply) for name in names)
+        found: dict[str, R] = {}
+        failed: dict[str, SwiftbotError] = {}
+        for name, answer in zip(names, await asyncio.gather(*calls, return_exceptions=True), strict=True):
+            if isinstance(answer, SwiftbotError):
+                failed[name] = answer
+            elif isinstance(answer, BaseException):
+                raise answer
+            else:
+                found[name] = answer
+        return found, failed
+
+    async def _all_of(self, gateway: str, verb: str, request: Struct, reply: type[R]) -> dict[str, R]:
+        """The same, but when none did what was asked, the reason of the first is raised."""
+        await self._known(gateway)
+        found, failed = await self._each(gateway, verb, request, reply)
+        if not found:
+            raise failed[min(failed)]
+        return found

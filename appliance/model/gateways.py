@@ -1,0 +1,131 @@
+"""What gateways tell of themselves, their containers and state volumes: facts with one owner."""
+
+from msgspec import Struct, field
+
+from appliance.model.open_enum import OpenEnum
+from appliance.model.placement import Need
+from appliance.model.planner import PlannerStatus
+from appliance.model.steering import Lease, SoftStop
+
+
+class ContainerState(OpenEnum):
+    """Life of a pooled container."""
+
+    STARTING = "starting"
+    READY = "ready"
+    RESERVED = "reserved"
+    BUSY = "busy"
+    DRAINING = "draining"
+    DEAD = "dead"
+
+
+class ContainerInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A pooled container, spoken for by the gateway that holds it."""
+
+    id: str
+    gateway: str
+    image: str
+    state: ContainerState
+    cpu: float = 1.0
+    memory_mb: int = 256
+    volumes: tuple[str, ...] = ()
+    compatible: tuple[str, ...] = ()
+    """Other images whose skills it can run as well (same base, requirements present)."""
+    runs: int = 0
+    run: str = ""
+    """Run id while busy."""
+    cold_ms: float | None = None
+    """What its own cold start took."""
+    since_ns: int = 0
+
+
+class VolumeInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A named state volume as the gateway that holds its newest state tells it. It outlives its containers."""
+
+    name: str
+    gateway: str
+    generation: int = 0
+    """Grows with each run that changed it; the highest is the newest."""
+    size_bytes: int = 0
+
+
+class PoolHint(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a plan will need of a pool: so many containers of an image, in about so long (algorithms: prewarming)."""
+
+    image: str
+    count: int = 1
+    in_s: float = 0.0
+    """From now until it is needed, on the receiver's clock."""
+    keep_s: float = 60.0
+    """How long beyond that it is worth keeping."""
+    task: str = ""
+    need: Need | None = None
+
+
+class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A gateway's own account of itself, pushed on change and every few seconds."""
+
+    id: str
+    fleet: str
+    version: str = ""
+    load: float = 0.0
+    """0 idle to 1 saturated: the larger of CPU and pool use."""
+    cpu_percent: float = 0.0
+    memory_mb: float = 0.0
+    """Resident memory of the daemon."""
+    capacity: int = 0
+    """Containers it may hold."""
+    containers: int = 0
+    ready: int = 0
+    running: int = 0
+    """Runs in progress."""
+    queue: int = 0
+    tasks: int = 0
+    """Tasks it coordinates that have not ended."""
+    draining: bool = False
+    drain: str = ""
+    """While it drains: how far it is, and what the runs that are left wait for."""
+    overloaded: str = ""
+    """Why runs are moved away from it, or were lately: it is given none meanwhile. Empty when all is well."""
+    catalogue: str = ""
+    """Digest of the skills it knows (verb `skills`); empty: not told."""
+    cores: int = 0
+    """Processor cores of the machine; 0: not told."""
+    pool_memory_mb: int = 0
+    """Memory that all its containers together may have; 0: not told."""
+    searches: dict[str, int] = field(default_factory=dict[str, int])
+    """How ready containers of others were looked for since it started: `asked` counts queries to other gateways,
+    `saved` those that were not needed because what was known was enough, `moved` runs that waited here and were
+    passed on."""
+    limits_enforced: bool = True
+    """False where the kernel's cgroups do not let rootless containers be limited."""
+    pool_problem: str = ""
+    """Why the pool cannot start containers, or holds fewer than it may for want of memory; empty when all is well."""
+    images: tuple[str, ...] = ()
+    """References of the images it has and can give to others."""
+    volumes: tuple[VolumeInfo, ...] = ()
+    """State volumes whose newest state is there."""
+    models: tuple[str, ...] = ()
+    """Language models it plans with, in order of asking, as `tier:name`; `rules` stands for the parser."""
+    planner: PlannerStatus | None = None
+    """How its planner does; a change of it alone is told with the next status."""
+    robots: tuple[str, ...] = ()
+    endpoints: tuple[str, ...] = ()
+    refused: dict[str, int] = field(default_factory=dict[str, int])
+    """Counters of bad input by kind, since start."""
+    monitor: dict[str, int] = field(default_factory=dict[str, int])
+    """What the execution monitor found and did as coordinator, by kind, since start."""
+    started_ns: int = 0
+    pid: int = 0
+    age_ms: int = 0
+    """How old its figures were when it was put."""
+    stops: tuple[SoftStop, ...] = ()
+    """Soft stops in force, as it knows them; at most 32, those of the whole fleet first."""
+    leases: tuple[Lease, ...] = ()
+    """Robots that operators have taken over, as it knows; at most 32."""
+    untold_ms: int = 0
+    """For how long its containers had changed without being told; 0: all that was put of them held."""
+    again_ms: int = 0
+    """It will be put again within so long, changed or not."""
+    asked: dict[str, float] = field(default_factory=dict[str, float])
+    """Image -> placements a second that this gateway decides, to the next power of two."""

@@ -1,0 +1,91 @@
+"""Plans: graphs of subtasks for one instruction, and where they came from."""
+
+import hashlib
+from typing import Any
+
+import msgspec
+from msgspec import Struct, field
+
+from appliance.model.open_enum import OpenEnum
+
+
+class Tier(OpenEnum):
+    """Where a plan came from, cheapest first (algorithms: cascade)."""
+
+    CACHE = "cache"
+    LOCAL = "local"
+    PEER = "peer"
+    """The local model of another gateway."""
+    UPSTREAM = "upstream"
+    RULES = "rules"
+
+
+class Subtask(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One node of a plan: a skill of the catalogue on a robot (`None`: computed on a gateway), after others.
+
+    `robot` is a roster name, or `any`, `any1`, ... until the task manager binds it, or `all`.
+    """
+
+    id: str
+    skill: str
+    robot: str | None = None
+    params: dict[str, Any] = field(default_factory=dict[str, Any])
+    after: tuple[str, ...] = ()
+
+
+class TierAttempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What one tier made of an instruction; `problems` says why its plan was not taken."""
+
+    tier: str
+    ok: bool
+    confidence: float = 0.0
+    latency_ms: float = 0.0
+    problems: tuple[str, ...] = ()
+
+
+class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Where a plan came from; it stays with the plan in the task's record."""
+
+    tier: Tier
+    model: str = ""
+    """The model that wrote it; empty for rules."""
+    gateway: str = ""
+    """The gateway that decomposed the instruction."""
+    confidence: float = 0.0
+    latency_ms: float = 0.0
+    """All tiers together, waiting included."""
+    attempts: tuple[TierAttempt, ...] = ()
+    """Every tier that was asked, in order."""
+    hash: str = ""
+    """`plan_hash` when it was made: a plan that was changed since has another."""
+    key: str = ""
+    """Under which it would be found in the plan cache, once it has been carried out with success."""
+    cache: str = ""
+    """How the plan cache was hit, in words; empty when it was not."""
+    confirm: tuple[str, ...] = ()
+    """Why an operator should agree before it runs; empty: nothing is against it."""
+
+
+class Plan(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A graph of subtasks for one instruction, with where it came from and how sure that tier is (0 to 1)."""
+
+    domain: str
+    subtasks: tuple[Subtask, ...]
+    tier: Tier = Tier.RULES
+    confidence: float = 0.0
+    latency_ms: float = 0.0
+    provenance: Provenance | None = None
+    """None for a plan that was written by hand."""
+
+
+def plan_hash(plan: Plan) -> str:
+    """Return the hash of what a plan does, not of how it came to be: what an approval is bound to.
+
+    SHA-256, as hex, of domain and subtasks as JSON with sorted keys, every field written out.
+    """
+    subtasks = [
+        {"id": each.id, "skill": each.skill, "robot": each.robot, "params": each.params, "after": list(each.after)}
+        for each in plan.subtasks
+    ]
+    canonical = msgspec.json.encode({"domain": plan.domain, "subtasks": subtasks}, order="sorted")
+    return hashlib.sha256(canonical).hexdigest()
