@@ -335,7 +335,8 @@ make_apart() {
   make_tools
   say "$name: packages of $lock"
   quiet "$name: $folder" "remove $folder and run it again" "$TOOLS/bin/uv" venv --quiet --clear --python /usr/bin/python3 "$folder"
-  quiet "$name: packages" "see the lines above" "$TOOLS/bin/uv" pip sync --quiet --require-hashes --only-binary :all: \
+  SCRATCH=$(mktemp -d "$STATE/tmp.XXXXXX")  # as above: not every package has a wheel
+  quiet "$name: packages" "see the lines above" env "TMPDIR=$SCRATCH" "$TOOLS/bin/uv" pip sync --quiet --require-hashes \
     --python "$folder/bin/python" "$PROJECT/$lock"
   echo "$want" >"$STATE/$name"
   say "$name: done"

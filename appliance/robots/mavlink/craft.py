@@ -16,7 +16,7 @@ from appliance.model import Pose, Site
 from appliance.model.geo import to_globe, to_site
 from appliance.robots.commands import Done, Verb
 from appliance.robots.mavlink import dialect
-from appliance.robots.mavlink.dialect import make
+from appliance.robots.mavlink.dialect import Message, make
 from appliance.robots.mavlink.modes import Modes
 from appliance.robots.mavlink.protocol import Patience, ask, command
 from appliance.robots.mavlink.vehicle import Vehicle
@@ -109,11 +109,11 @@ class Craft:
 
     # --- modes and motors --------------------------------------------------------------------------------------
 
-    async def mode(self, name: str, *, safe: bool = False) -> None:
+    async def mode(self, name: str, *, safe: bool = False, behind: Message | None = None) -> None:
         """Change the mode and wait until the heartbeat says so; RobotFailure when it does not, or is taken over.
 
         A pilot may take the vehicle at any moment of the change, so control is looked at before each sending: a repeat
-        would take it back from them. `safe`: goes on under a failsafe.
+        would take it back from them. `safe`: goes on under a failsafe. `behind`: sent right behind the first request.
         """
         vehicle = self.vehicle
         wanted = self.modes.numbers[name]
@@ -133,7 +133,10 @@ class Craft:
             # acknowledgement that comes late may be that one's.
             sent = loop.time()
             flag = dialect.CUSTOM_MODE_FLAG
-            await command(vehicle, dialect.SET_MODE, flag, wanted, patience=self.patience, check=check)
+            await command(
+                vehicle, dialect.SET_MODE, flag, wanted, patience=self.patience, check=check, behind=behind
+            )
+            behind = None
             if await self.confirm(lambda since=sent: changed(since)):
                 return
         raise RobotFailure("robot", f"{vehicle.name} stays in {vehicle.mode} instead of {name}", retryable=True)

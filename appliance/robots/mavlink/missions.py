@@ -14,16 +14,18 @@ from itertools import pairwise
 import structlog
 
 from appliance.robots.commands import Done
-from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink import dialect, parameters
 from appliance.robots.mavlink.craft import POLL_S, Craft, Point
 from appliance.robots.mavlink.dialect import Message, make
-from appliance.robots.mavlink.protocol import Item, accepted, ask, command, download, upload
+from appliance.robots.mavlink.protocol import Item, Patience, accepted, ask, command, command_long, download, upload
 from appliance.robots.policy import check_mission, check_orbit, check_points
 from appliance.robots.verbs import MissionArgs, MissionStep, OrbitArgs, RobotFailure, Waypoint, cruise
 
 log = structlog.get_logger(__name__)
 
 _SETTLED_MPS = 0.5
+_ASKED = 2
+"""How often a parameter is asked for that not every autopilot has."""
 _MISSION_CURRENT = dialect.constant("MAVLINK_MSG_ID_MISSION_CURRENT")
 LOWEST_M = 1.0
 ACTS = {
@@ -231,7 +233,11 @@ class Missions:
         if first == 0:
             vehicle.forget_mission()
         try:
-            await craft.mode(craft.modes.mission)
+            # Said again right behind the mode, where entering it begins anew: whatever is done at the items before
+            # would be done twice until an answer came.
+            again = first > 0 and await self._begins_anew()
+            behind = command_long(vehicle, dialect.SET_CURRENT, float(first)) if again else None
+            await craft.mode(craft.modes.mission, behind=behind)
             # ArduPilot denies a first or last item here.
             await command(vehicle, dialect.MISSION_START, 0, 0, patience=craft.patience, check=craft.check_control)
             if first > 0:
@@ -242,8 +248,16 @@ class Missions:
                 await craft.halt()
             raise
 
+    async def _begins_anew(self) -> bool:
+        """Whether entering the mode begins the mission anew (ArduPilot's MIS_RESTART); False where it is not told."""
+        patience = Patience(timeout_s=self._craft.patience.timeout_s, tries=_ASKED)
+        try:
+            return await parameters.read(self._craft.vehicle, "MIS_RESTART", patience=patience) != 0
+        except RobotFailure:
+            return False  # another autopilot, or a lossy link: `_stay_at` sees to it
+
     async def _stay_at(self, item: int) -> None:
-        """Say the item again where entering the mode has begun the mission anew, as ArduPilot does by MIS_RESTART = 1.
+        """Say the item again where the mission was begun anew all the same.
 
         Where it has not, nothing is said: the item may be behind already, and what is done at it would be done twice.
         """

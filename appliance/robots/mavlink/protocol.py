@@ -72,6 +72,7 @@ async def command(
     patience: Patience,
     component: int | None = None,
     check: Callable[[], None] = _always,
+    behind: Message | None = None,
 ) -> Outcome:
     """Send COMMAND_LONG until it is acknowledged.
 
@@ -82,12 +83,13 @@ async def command(
         patience: how long and how often.
         component: another than the autopilot.
         check: called right before each sending, repeats too; raises RobotFailure when it may not be sent any more.
+        behind: sent right behind the first sending, for what may not wait for the answer; not repeated.
 
     Raises:
         RobotFailure: `robot` when the vehicle declines (with its own words where it gave some), or, retryable,
             when no acknowledgement came after all tries; what `check` raises.
     """
-    outcome = await ask(vehicle, number, *parameters, patience=patience, component=component, check=check)
+    outcome = await ask(vehicle, number, *parameters, patience=patience, component=component, check=check, behind=behind)
     return accepted(vehicle, number, outcome)
 
 
@@ -98,23 +100,30 @@ async def ask(
     patience: Patience,
     component: int | None = None,
     check: Callable[[], None] = _always,
+    behind: Message | None = None,
 ) -> Outcome:
     """Send COMMAND_LONG as `command` does, and return whatever it is answered with."""
-    values = (*parameters, *([0.0] * 7))[:7]
     target = vehicle.component if component is None else component
-    fields = {f"param{index + 1}": value for index, value in enumerate(values)}
 
     def build(confirmation: int) -> Message:
-        return make(
-            "COMMAND_LONG",
-            target_system=vehicle.system,
-            target_component=target,
-            command=number,
-            confirmation=min(confirmation, 255),
-            **fields,
-        )
+        return command_long(vehicle, number, *parameters, component=target, confirmation=confirmation)
 
-    return await _exchange(vehicle, build, number, target, patience, check)
+    return await _exchange(vehicle, build, number, target, patience, check, behind)
+
+
+def command_long(
+    vehicle: Vehicle, number: int, *parameters: float, component: int | None = None, confirmation: int = 0
+) -> Message:
+    """Make a COMMAND_LONG: MAV_CMD, up to seven parameters, and how often it was sent before."""
+    values = (*parameters, *([0.0] * 7))[:7]
+    return make(
+        "COMMAND_LONG",
+        target_system=vehicle.system,
+        target_component=vehicle.component if component is None else component,
+        command=number,
+        confirmation=min(confirmation, 255),
+        **{f"param{index + 1}": value for index, value in enumerate(values)},
+    )
 
 
 async def command_at(
@@ -172,6 +181,7 @@ async def _exchange(
     component: int,
     patience: Patience,
     check: Callable[[], None] = _always,
+    behind: Message | None = None,
 ) -> Outcome:
     """Send a command until it is answered; RobotFailure, retryable, when it never is."""
     loop = asyncio.get_running_loop()
@@ -181,6 +191,8 @@ async def _exchange(
         for attempt in range(patience.tries):
             check()
             vehicle.send(build(attempt))
+            if behind is not None and attempt == 0:
+                vehicle.send(behind)
             answer = await _acknowledgement(vehicle, answers, number, component, patience.timeout_s)
             if answer is None:
                 continue
