@@ -72,16 +72,16 @@ def train_export(run: Path, folder: Path, *, precision: str = "int4", most: int 
 
 
 @train_app.command(name="tune")
-def train_tune(run: Path, folder: Path, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
-    """Fine-tune a trained run for a site, with its own skills and logged plans; then `export` it as any.
+def train_tune(base: str, folder: Path, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
+    """Fine-tune a planner for a site, with its own skills and logged plans; then `export` it as any.
 
     Args:
-        run: Folder of the training run to begin with.
+        base: What to begin with: folder of a training run or of a model, or `embedded`.
         folder: Where the tuned run is kept.
-        options: As `swiftbot train tune RUN FOLDER -- --help` tells: --plans JSONL (needed), --skills FOLDER,
+        options: As `swiftbot train tune BASE FOLDER -- --help` tells: --plans JSONL (needed), --skills FOLDER,
             --minutes, --steps, --share, ...
     """
-    _with_torch("appliance.llm.train.tune", [str(run), str(folder), *options])
+    _with_torch("appliance.llm.train.tune", [base, str(folder), *options])
 
 
 def _with_torch(module: str, arguments: list[str]) -> NoReturn:

@@ -25,6 +25,7 @@ from appliance.llm.slot import Slot
 from appliance.llm.speaking import Question
 from appliance.llm.train.card import card_of, model_card, write_card
 from appliance.llm.train.corpus import corpus_examples
+from appliance.llm.train.ending import ended
 from appliance.llm.train.examples import Example
 from appliance.llm.train.judge import is_exact
 from appliance.llm.train.splits import split
@@ -147,4 +148,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(main))

@@ -9,6 +9,9 @@ The rate is constant and goes down to nothing at the end (`cooldown`). Before it
 a run that is done goes on from there when it is given more steps, with more pairs if the corpus has grown.
 
     python -m appliance.llm.train.fit FOLDER --steps 8000
+
+A run may begin with the weights of another, or of a model folder (`--base`): what was learned is kept, and the corpus
+as it is now is learned besides.
 """
 
 import argparse
@@ -18,67 +21,28 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
-from transformers import LlamaConfig, LlamaForCausalLM
+from transformers import LlamaForCausalLM
 
-from appliance.llm.train.batches import CONTEXT, Batch, Groups
+from appliance.errors import ConflictError
+from appliance.llm.train.batches import Batch, Groups
 from appliance.llm.train.corpus import corpus_examples
+from appliance.llm.train.ending import ended
 from appliance.llm.train.examples import Example
 from appliance.llm.train.forward import AnswerLoss
 from appliance.llm.train.judge import judge
+from appliance.llm.train.model import CHECKPOINT, RECIPE, Base, Recipe, new_model
 from appliance.llm.train.site import Pairs
 from appliance.llm.train.splits import split
-from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
+from appliance.llm.train.tokens import Tokens
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 TRUNK = "trunk.pt"
-CHECKPOINT = "checkpoint.pt"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """How a model is made; kept beside it."""
-
-    seed: int = 1
-    width: int = 256
-    layers: int = 6
-    heads: int = 4
-    key_heads: int = 2
-    inner: int = 704
-    batch_tokens: int = 4096
-    steps: int = 8_000
-    rate: float = 2e-3
-    warmup: int = 200
-    cooldown: float = 0.35
-    """Share of the steps at the end in which the rate goes down."""
-    decay: float = 0.1
-    original: float = 0.1
-    """Share of examples as they were written, without variation."""
-
-
-def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:
-    """Return a model with random weights."""
-    torch.manual_seed(recipe.seed)
-    config = LlamaConfig(
-        vocab_size=tokens.size,
-        hidden_size=recipe.width,
-        intermediate_size=recipe.inner,
-        num_hidden_layers=recipe.layers,
-        num_attention_heads=recipe.heads,
-        num_key_value_heads=recipe.key_heads,
-        max_position_embeddings=CONTEXT,
-        tie_word_embeddings=True,
-        rms_norm_eps=1e-5,
-        bos_token_id=tokens.of(BEGIN),
-        eos_token_id=tokens.of(END),
-        pad_token_id=tokens.of(PAD),
-    )
-    return LlamaForCausalLM(config)
 
 
 def cools_at(recipe: Recipe) -> int:
@@ -143,7 +107,7 @@ class Trainer:
             self._held_out["site"] = site.held_out
             times = max(1, round(share / (1 - share) * len(self._examples) / max(1, len(site.train))))
             self._examples = (*self._examples, *(each for each in site.train for _ in range(times)))
-        kept = folder / "recipe.json"
+        kept = folder / RECIPE
         if kept.is_file():
             recipe = replace(Recipe(**json.loads(kept.read_text())), steps=recipe.steps)
             self._tokens = Tokens.load(folder)
@@ -175,6 +139,11 @@ class Trainer:
             self._step, self._group, self._inside = int(state["step"]), int(state["group"]), int(state["inside"])
             self._progress(f"goes on from step {self._step:,} of {name}")
             return
+        if (self._folder / CHECKPOINT).is_file():
+            raise ConflictError(
+                f"{self._folder} has gone down for another number of steps, and has no {TRUNK} to go on from",
+                remedy="give the steps it was begun with, or begin another run with this one as --base",
+            )
 
     def save(self) -> None:
         """Write the checkpoint and the model; a run that dies while it does keeps the one before."""
@@ -193,6 +162,14 @@ class Trainer:
 
     def run(self, *, minutes: float = math.inf, look_every: int = 500) -> dict[str, Any]:
         """Train until the recipe's steps are done or the time is over; return the last figures."""
+        try:
+            return self._run(minutes, look_every)
+        except KeyboardInterrupt:
+            self.save()
+            self._progress(f"stopped after step {self._step:,}; run it again to go on")
+            raise
+
+    def _run(self, minutes: float, look_every: int) -> dict[str, Any]:
         until = time.monotonic() + 60 * minutes
         parameters = sum(each.numel() for each in self._model.parameters())
         self._progress(f"{parameters / 1e6:.1f} M parameters, {len(self._examples):,} pairs, on {self._device}")
@@ -304,15 +281,21 @@ def main(arguments: Sequence[str]) -> int:
     for each in fields(Recipe):
         kind = type(each.default)
         parser.add_argument(f"--{each.name.replace('_', '-')}", type=kind, help=f"by default {each.default}")
+    parser.add_argument(
+        "--base", help="a run, a model folder or `embedded`: begin with its weights, and as large (not to go on)"
+    )
     given = parser.parse_args(arguments)
     if given.threads:
         torch.set_num_threads(given.threads)
     said = {each.name: value for each in fields(Recipe) if (value := getattr(given, each.name)) is not None}
-    kept = given.folder / "recipe.json"
-    recipe = Recipe(**json.loads(kept.read_text())) if kept.is_file() else Recipe()
+    kept = given.folder / RECIPE
+    base = Base(given.base) if given.base and not kept.is_file() else None
+    recipe = Recipe(**json.loads(kept.read_text())) if kept.is_file() else base.recipe if base else Recipe()
     other = {name for name, value in said.items() if getattr(recipe, name) != value} - {"steps"}
     if kept.is_file() and other:
         parser.error(f"{given.folder} was begun with other {', '.join(sorted(other))}: begin another run")
+    if base is not None:
+        base.prepare(given.folder, load_catalogue(), replace(recipe, **said))
     trainer = Trainer(
         given.folder,
         replace(recipe, **said),
@@ -325,4 +308,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(main))

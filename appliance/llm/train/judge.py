@@ -1,28 +1,23 @@
 # pyright: basic, reportMissingImports=false
 # PyTorch is of the extra `train`, which neither gateways nor the development environment have.
-"""How well a model answers examples, counted by the shared scorer.
+"""How well a model answers examples, as the scorer counts it.
 
 It answers greedily and held by nothing: what the guide adds (`language.guide`) is seen by the benchmark of plans.
 """
 
-import functools
-import importlib.util
-import os
 from collections.abc import Sequence
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 
-from appliance.errors import NotFoundError, PlanError
+from appliance.errors import PlanError
 from appliance.llm.language.codec import Answer, read
 from appliance.llm.language.words import Words, words_of
+from appliance.llm.scoring import Score, mean_figures, score
 from appliance.llm.train.examples import Example
 from appliance.llm.train.tokens import END, PAD, Tokens
 from appliance.skills.catalogue import Catalogue
 
-FIGURES = ("decomposition", "parallel_recall", "subtask_f1", "param_f1", "exact", "domain", "valid")
 MAX_ANSWER = 320
 
 
@@ -55,8 +50,7 @@ def answers(model: Any, tokens: Tokens, prompts: Sequence[list[int]], *, batch: 
 
 def judge(model: Any, tokens: Tokens, examples: Sequence[Example], catalogue: Catalogue) -> dict[str, Any]:
     """Return percent by figure over examples, refusals counted apart (`refused`: answered alike)."""
-    score = scorer()
-    rows: list[dict[str, Any]] = []
+    rows: list[Score] = []
     refused: list[bool] = []
     said = answers(model, tokens, [tokens.prompt(each.words, each.own) for each in examples])
     for example, answer in zip(examples, said, strict=True):
@@ -66,11 +60,8 @@ def judge(model: Any, tokens: Tokens, examples: Sequence[Example], catalogue: Ca
             refused.append(symbols[:1] == ["none"])
             continue
         gold = read(example.symbols, words, catalogue)
-        rows.append(score.score_case({"id": "", "gold": _plain(gold)}, _prediction(symbols, words, catalogue)))
-    figures: dict[str, Any] = {"cases": len(rows)}
-    for name in FIGURES:
-        values = [float(row[name]) for row in rows if row[name] is not None]
-        figures[name] = round(100 * sum(values) / len(values), 1) if values else None
+        rows.append(score(_prediction(symbols, words, catalogue), _plain(gold)))
+    figures = mean_figures(rows)
     figures["refused"] = round(100 * sum(refused) / len(refused), 1) if refused else None
     return figures
 
@@ -91,23 +82,7 @@ def _plain(answer: Answer) -> dict[str, Any]:
 
 
 def is_exact(said: Answer, gold: Answer) -> bool:
-    """Whether an answer is the right one, by the shared scorer; a refusal is right whatever its kind."""
+    """Whether an answer is the right one, by the scorer; a refusal is right whatever its kind."""
     if said.refused or gold.refused:
         return bool(said.refused) == bool(gold.refused)
-    return scorer().score_case({"id": "", "gold": _plain(gold)}, _plain(said))["exact"] == 1
-
-
-@functools.cache
-def scorer() -> ModuleType:
-    """Return the shared scorer, `decomposition/score.py` of `$SWIFTBOT_SHARED` or of ../shared."""
-    named = os.environ.get("SWIFTBOT_SHARED", "")
-    folder = Path(named) if named else Path(__file__).resolve().parents[4] / "shared"
-    path = folder / "decomposition" / "score.py"
-    spec = importlib.util.spec_from_file_location("decomposition_score", path)
-    if not path.is_file() or spec is None or spec.loader is None:
-        raise NotFoundError(
-            f"no scorer at {path}", remedy="set SWIFTBOT_SHARED to the folder with decomposition/score.py"
-        )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return score(_plain(said), _plain(gold)).exact == 1

@@ -1,55 +1,36 @@
 # pyright: basic, reportMissingImports=false
 # PyTorch is of the extra `train`, which neither gateways nor the development environment have.
-"""Fine-tunes a trained planner for a site: its own skills and its own way of speaking, from logged plans.
+"""Fine-tunes a planner for a site, the embedded one or another: its own skills and way of speaking, from logged plans.
 
 Half of each batch (`--share`) is the site's pairs, varied as all are, the other half the hand-written ones, so that
 what was learned is not forgotten. A tenth of the site's pairs is held out; figures on it are told before and after. The
 result is a run like any other: `export` makes its model folder.
 
-    python -m appliance.llm.train.tune RUN NEW --plans PLANS.jsonl --skills FOLDER --minutes 20
+    python -m appliance.llm.train.tune embedded NEW --plans PLANS.jsonl --skills FOLDER --minutes 20
 """
 
 import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from appliance.llm.train.fit import CHECKPOINT, Recipe, Trainer, new_model
+from appliance.llm.train.ending import ended
+from appliance.llm.train.fit import Trainer
+from appliance.llm.train.model import Base
 from appliance.llm.train.site import Pairs, read_pairs
-from appliance.llm.train.tokens import Tokens
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 SITE = "site.json"
 """In a run that was tuned: the folders of the site's skills."""
 
 
-def prepare(base: Path, folder: Path, catalogue: Catalogue, recipe: Recipe) -> None:
-    """Lay out a run that begins with the weights of another, with tokens for skills that it did not know.
-
-    A new token begins as the mean of all: as unlikely as any, and ready to be learned.
-    """
-    before = Tokens.load(base)
-    tokens = before.extended(catalogue)
-    folder.mkdir(parents=True, exist_ok=False)
-    tokens.save(folder)
-    (folder / "recipe.json").write_text(json.dumps(asdict(recipe), indent=1))
-    state = torch.load(base / CHECKPOINT, map_location="cpu", weights_only=True)["model"]
-    for name in ("model.embed_tokens.weight", "lm_head.weight"):
-        if name in state and tokens.size > len(state[name]):
-            mean = state[name].mean(dim=0, keepdim=True)
-            state[name] = torch.cat([state[name], mean.expand(tokens.size - len(state[name]), -1)])
-    new_model(recipe, tokens).load_state_dict(state)  # it fits, or says what does not
-    begun = {"optimisers": [], "step": 0, "group": 0, "inside": 0, "steps": recipe.steps, "cooling": False}
-    torch.save({"model": state, **begun}, folder / CHECKPOINT)
-
-
 def tune(
-    base: Path,
+    base: str,
     folder: Path,
     *,
     plans: Path,
@@ -63,7 +44,7 @@ def tune(
     """Tune; return the figures on what is held out, before and after.
 
     Args:
-        base: folder of a training run.
+        base: folder of a training run or of a model, or `embedded`.
         folder: of the new run; must not exist, or be one that was stopped.
         plans: JSONL, as `site.read_pairs` takes it.
         skills: folders of the site's own skills.
@@ -79,10 +60,10 @@ def tune(
         print(f"left out: {each}", flush=True)
     if not pairs.train:
         raise SystemExit(f"{plans} has no pair to learn from")
-    recipe = Recipe(**json.loads((base / "recipe.json").read_text()))
-    recipe = replace(recipe, steps=steps, rate=rate, warmup=min(100, steps // 10))
+    begin = Base(base)
+    recipe = replace(begin.recipe, steps=steps, rate=rate, warmup=min(100, steps // 10))
     if not folder.exists():
-        prepare(base, folder, catalogue, recipe)
+        begin.prepare(folder, catalogue, recipe)
         (folder / SITE).write_text(json.dumps({"skills": [str(each) for each in skills]}))
     trainer = Trainer(
         folder,
@@ -108,7 +89,7 @@ def catalogue_of(run: Path) -> Catalogue:
 def main(arguments: Sequence[str]) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description="Fine-tune a planner for a site; run it again to go on.")
-    parser.add_argument("base", type=Path, help="folder of the training run to begin with")
+    parser.add_argument("base", help="folder of the training run or model to begin with, or `embedded`")
     parser.add_argument("folder", type=Path, help="where the tuned run is kept")
     parser.add_argument("--plans", type=Path, required=True, help="JSONL: instruction and gold, or task records")
     parser.add_argument("--skills", type=Path, action="append", default=[], help="a folder of the site's skills")
@@ -139,4 +120,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(main))

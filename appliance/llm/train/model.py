@@ -1,0 +1,115 @@
+# pyright: basic, reportMissingImports=false
+# PyTorch is of the extra `train`, which neither gateways nor the development environment have.
+"""What is trained: the recipe, the model it describes, and a run that begins with the weights of another.
+
+Those may be another run's, or the ones of a model folder (`weights`): the embedded planner can be tuned where nobody
+has the run that it came from.
+"""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from transformers import LlamaConfig, LlamaForCausalLM
+
+from appliance.errors import NotFoundError
+from appliance.llm.embedded import folder_of
+from appliance.llm.train.batches import CONTEXT
+from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
+from appliance.llm.train.weights import is_model, read_weights
+from appliance.skills.catalogue import Catalogue
+
+CHECKPOINT = "checkpoint.pt"
+RECIPE = "recipe.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """How a model is made; kept beside it."""
+
+    seed: int = 1
+    width: int = 256
+    layers: int = 6
+    heads: int = 4
+    key_heads: int = 2
+    inner: int = 704
+    batch_tokens: int = 4096
+    steps: int = 8_000
+    rate: float = 2e-3
+    warmup: int = 200
+    cooldown: float = 0.35
+    """Share of the steps at the end in which the rate goes down."""
+    decay: float = 0.1
+    original: float = 0.1
+    """Share of examples as they were written, without variation."""
+
+
+def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:
+    """Return a model with random weights."""
+    torch.manual_seed(recipe.seed)
+    config = LlamaConfig(
+        vocab_size=tokens.size,
+        hidden_size=recipe.width,
+        intermediate_size=recipe.inner,
+        num_hidden_layers=recipe.layers,
+        num_attention_heads=recipe.heads,
+        num_key_value_heads=recipe.key_heads,
+        max_position_embeddings=CONTEXT,
+        tie_word_embeddings=True,
+        rms_norm_eps=1e-5,
+        bos_token_id=tokens.of(BEGIN),
+        eos_token_id=tokens.of(END),
+        pad_token_id=tokens.of(PAD),
+    )
+    return LlamaForCausalLM(config)
+
+
+class Base:
+    """Where another run begins: a run, a model folder, or `embedded`.
+
+    Args:
+        name: as it is given on the command line.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.folder = Path(folder_of(name))
+        self.recipe = Recipe()
+        self.state: dict[str, Any]
+        """Weights by the names of `transformers`."""
+        if (self.folder / CHECKPOINT).is_file():
+            self.recipe = Recipe(**json.loads((self.folder / RECIPE).read_text()))
+            self.state = torch.load(self.folder / CHECKPOINT, map_location="cpu", weights_only=True)["model"]
+        elif is_model(self.folder):
+            shape, weights = read_weights(self.folder)
+            self.recipe = replace(self.recipe, **asdict(shape))
+            self.state = {key: torch.from_numpy(each.copy()) for key, each in weights.items()}
+        else:
+            raise NotFoundError(
+                f"{self.folder} is neither a training run nor a model",
+                remedy="give a run, a model folder or `embedded`",
+            )
+
+    def prepare(self, folder: Path, catalogue: Catalogue, recipe: Recipe) -> None:
+        """Lay out a run that begins with these weights, with tokens for skills that they do not know.
+
+        A new token begins as the mean of all: as unlikely as any, and ready to be learned.
+
+        Args:
+            folder: of the new run; must not exist.
+            catalogue: its skills.
+            recipe: how it is trained; as large as this one is.
+        """
+        tokens = Tokens.load(self.folder).extended(catalogue)
+        state = dict(self.state)
+        for name in ("model.embed_tokens.weight", "lm_head.weight"):
+            if name in state and tokens.size > len(state[name]):
+                mean = state[name].mean(dim=0, keepdim=True)
+                state[name] = torch.cat([state[name], mean.expand(tokens.size - len(state[name]), -1)])
+        new_model(recipe, tokens).load_state_dict(state)  # it fits, or says what does not
+        folder.mkdir(parents=True, exist_ok=False)
+        tokens.save(folder)
+        (folder / RECIPE).write_text(json.dumps(asdict(recipe), indent=1))
+        begun = {"optimisers": [], "step": 0, "group": 0, "inside": 0, "steps": recipe.steps, "cooling": False}
+        torch.save({"model": state, **begun}, folder / CHECKPOINT)
