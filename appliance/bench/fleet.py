@@ -70,6 +70,7 @@ class Orders:
         match event.kind:
             case RunEventKind.STARTED:
                 outcome.started_ms = at_ms
+                outcome.within_ms = event.startup_ms if event.startup_ms is not None else outcome.within_ms
                 outcome.gateway = event.gateway
                 outcome.phase = event.phase.value if event.phase else ""
             case RunEventKind.SUCCEEDED:
@@ -96,7 +97,7 @@ class Orders:
         name = f"n{self._number}"
         now = time.monotonic()
         intended = now if intended is None else intended
-        outcome, ended = Outcome(sent_ms=(now - intended) * 1e3), asyncio.Event()
+        outcome, ended = Outcome(sent_ms=(now - intended) * 1e3, asked=gateway), asyncio.Event()
         self._open[name] = (intended, outcome, ended)
         request = RunRequest(
             task=self._task, subtask=name, attempt=1, skill=SKILL, need=self._need,

@@ -20,6 +20,8 @@ ZIPF = 1.5
 """Exponent of uneven arrivals, weight 1 / rank^1.5: of four gateways the first gets 60 % of the runs."""
 MOST_UNSERVED = 0.01
 """Share of runs that may be refused, fail or be lost before the load counts as too much: p99 stays defined."""
+SLOWEST = 12
+"""Starts that are told one by one, the slowest first: what the tail is made of."""
 SATURATED = 0.9
 """A machine, or a daemon's one core, that is busy for more than this part of the time is full."""
 
@@ -38,6 +40,11 @@ class Outcome(Struct, kw_only=True):
     """How late the order left: what the sender itself could not keep up with."""
     started_ms: float = float("inf")
     ended_ms: float = float("inf")
+    within_ms: float = float("inf")
+    """What the gateway where it ran took of that, from its order to the handler's first line; the rest is the way there
+    and back, and for a run elsewhere what the asked gateway took to find that."""
+    asked: str = ""
+    """Where it was ordered."""
     gateway: str = ""
     """Where it ran."""
     phase: str = ""
@@ -93,6 +100,8 @@ def account(outcomes: Sequence[Outcome], seen: Sampled) -> dict[str, Any]:
         "end": summary([each.ended_ms for each in outcomes]),
         "unserved": dict(Counter(each.problem for each in outcomes if each.problem)),
         "phases": dict(Counter(each.phase for each in outcomes if each.phase)),
+        "ways": {phase: _way([each for each in outcomes if each.phase == phase]) for phase in _phases(outcomes)},
+        "slowest": [_slow(each) for each in sorted(outcomes, key=lambda each: -each.started_ms)[:SLOWEST]],
         "ran_on": dict(sorted(Counter(each.gateway for each in outcomes if each.gateway).items())),
         "sender_late_p99": finite(quantile(sent, 0.99)) if sent else None,
         "cpu": round(seen.cpu, 3),
@@ -100,6 +109,29 @@ def account(outcomes: Sequence[Outcome], seen: Sampled) -> dict[str, Any]:
         "queue": {name: length for name, length in seen.queue.items() if length},
         "containers": seen.containers,
         "counted": seen.refused,
+    }
+
+
+def _phases(outcomes: Sequence[Outcome]) -> list[str]:
+    return sorted({each.phase for each in outcomes if each.phase})
+
+
+def _way(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Return how long the starts of one phase took, and the gateways where they ran of that."""
+    return {
+        "start": summary([each.started_ms for each in outcomes]),
+        "within": summary([each.within_ms for each in outcomes]),
+    }
+
+
+def _slow(outcome: Outcome) -> dict[str, Any]:
+    return {
+        "start": finite(outcome.started_ms),
+        "within": finite(outcome.within_ms),
+        "sent": finite(outcome.sent_ms),
+        "phase": outcome.phase,
+        "asked": outcome.asked,
+        "ran_on": outcome.gateway,
     }
 
 

@@ -22,10 +22,11 @@ from appliance.errors import PrerequisiteError
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import LABEL_FLEET, LABEL_GATEWAY, remove_fleet
+from appliance.pool.folders import podman_name
 from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.settings import TransferConfig
 from appliance.pool.transfer.transfers import Transfers
-from appliance.pool.volumes import Volumes, podman_name
+from appliance.pool.volumes import Volumes
 
 _READY_S = 60.0
 _LINE = b"2.718281828 x=1.250 y=3.500 theta=0.100 battery=0.87\n"

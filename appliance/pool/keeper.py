@@ -14,25 +14,22 @@ from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
-import msgspec
 import structlog
 
-from appliance.errors import PoolError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import ContainerInfo, ContainerState, Need, PoolHint
+from appliance.errors import SwiftbotError, UnreachableError
+from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool.books import FOR_A_RUN, Books
 from appliance.pool.container import PooledContainer
 from appliance.pool.decisions import Decisions
 from appliance.pool.engine import LABEL_ID, Engine, EngineFacts
-from appliance.pool.experience import Experience
-from appliance.pool.glance import glance
 from appliance.pool.link import EngineLink
-from appliance.pool.policies import Planner, Retire, View
+from appliance.pool.planning import Planning
 from appliance.pool.policies.planner import Weighed
-from appliance.pool.pressure import MemoryWatch, Reading
+from appliance.pool.pressure import Reading
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 from appliance.pool.starts import Starts
-from appliance.pool.turns import Completions, Turn
+from appliance.pool.turns import Turn
 
 log = structlog.get_logger(__name__)
 
@@ -78,29 +75,28 @@ class Keeper:
     ) -> None:
         self.decisions = Decisions()
         self.books = Books(config, begin=self._begin, on_change=on_change, refused=refused)
-        self.books.full = self._full
-        self._completions = Completions()
         self.link = EngineLink(make_engine, reconnect_s=config.reconnect_s, on_connected=self._on_connected)
         self._config = config
-        self._gateway = gateway
         self._images = tuple(images)
-        self._refused = refused
         self._on_evicted = on_evicted
         self._wake = asyncio.Event()
         self._starter = make_starter(lambda container: self.retire(container, "it died"))
         self.starts = Starts(
             config, starter=self._starter, link=self.link, decisions=self.decisions, on_end=self._on_started
         )
-        self._planner = Planner(
-            config.baseline(), self.starts.costs, lambda image: self._starter.size(image).memory_mb, hour=_hour
-        )
-        self._memory = MemoryWatch(
-            config.pressure,
-            memory_mb=config.memory_mb,
-            held_mb=lambda: self.books.memory_mb,
+        self.planning = Planning(
+            config,
+            gateway=gateway,
+            images=self._images,
+            books=self.books,
+            starts=self.starts,
+            starter=self._starter,
+            link=self.link,
             on_change=self._wake.set,
-            read=read_memory,
+            refused=refused,
+            read_memory=read_memory,
         )
+        self.books.full = self.planning.full
         self._background: set[asyncio.Task[None]] = set()
         self._next_sweep = math.inf
         self.draining = False
@@ -116,87 +112,14 @@ class Keeper:
         """Why containers, or those of some image, cannot be started now; empty when they can."""
         return self.link.problem or "; ".join(self.starts.problems(self._images).values())
 
-    @property
-    def squeeze(self) -> str:
-        """Why the pool holds less than it is allowed, when the machine is short of memory; empty otherwise."""
-        squeeze = self._memory.squeeze
-        return squeeze.reason and f"{squeeze.reason}: {squeeze.budget_mb} of {self._config.memory_mb} MB for containers"
-
-    def check_startable(self, need: Need, turn: Turn | None = None) -> None:
-        """Raise when a cold start now would be in vain.
-
-        Raises:
-            PoolError: Podman is away.
-            RefusedError: the image does not start, or everything is busy and too many wait.
-        """
-        self._check_image(need.image)
-        if self.books.queue >= self._config.queue and self._room(self._size_mb(need), for_run=True) is None:
-            # A full queue turns away whoever would be served last, which need not be the one who comes.
-            if turn is not None and self.books.queue and not self.books.would_be_last(turn):
-                return
-            self._refused["queue full"] += 1
-            raise self._full()
-
-    def _full(self) -> RefusedError:
-        after_s = self.expected_s(self.books.queue + 1)
-        when = "wait" if after_s is None else f"ask again in about {after_s:.1f} s"
-        return RefusedError(
-            f"all {len(self.books)} containers of {self._gateway} are busy and {self.books.queue} runs wait"
-            + (f"; {self.squeeze}" if self.squeeze else ""),
-            remedy=f"{when}, or raise pool.capacity",
-            retry_after_s=after_s or 0.0,
-        )
-
-    def expected_s(self, position: int) -> float | None:
-        """In how many seconds the run at a place in the queue (from 1) may have a container; None: not known."""
-        return self._completions.expected_s(position, len(self.books))
-
-    def _check_image(self, image: str) -> None:
-        if self.link.problem:
-            raise PoolError(self.link.problem, remedy="swiftbot doctor tells more")
-        if reason := self.starts.why_not(image):
-            self._refused["quarantined image"] += 1
-            raise RefusedError(reason, remedy="swiftbot images build, then swiftbot pool release")
-
-    def why_no_start(self, image: str) -> str:
-        """Return why one more container of an image cannot be started ahead now; empty when it can."""
-        if reason := self.link.problem or self.starts.why_not(image):
-            return reason
-        size_mb = self._starter.size(image).memory_mb
-        victims = self._room(size_mb, for_run=False)
-        if victims is not None and not any(self._image_of(each) == image for each in victims):
-            return ""
-        holders = Counter(f"{each.info.state} {each.info.image}" for each in self.books)
-        return (
-            f"no room for one more {image} container ({size_mb} MB): {len(self.books)} of {self._config.capacity}"
-            f" places and {self.books.memory_mb} of {self._memory.squeeze.budget_mb} MB are taken by "
-            + ", ".join(f"{count} {what}" for what, count in sorted(holders.items()))
-            + (f"; {self.squeeze}" if self.squeeze else "")
-        )
-
     # --- what others ask --------------------------------------------------------------------------------------
-
-    def hinted(self, hint: PoolHint) -> None:
-        """Note what will be needed here."""
-        self._planner.hinted(hint, time.monotonic())
-        self._wake.set()
-
-    def arrived(self, image: str) -> None:
-        """Note that a run begins here, or waits for a container."""
-        self._planner.arrived(image, time.monotonic())
-
-    def ended(self, image: str, held_s: float) -> None:
-        """Note that a run that had arrived is over, having had its container for so long (0: it had none)."""
-        if held_s > 0:
-            self._completions.ended(held_s)
-        self._planner.ended(image, held_s, time.monotonic())
 
     async def have(self, image: str, count: int) -> None:
         """Wait until so many containers of an image are ready, or no more can be started."""
         await self.books.until(
             lambda: (
                 self.books.count(image, ContainerState.READY) >= count
-                or (not self.starts and bool(self.why_no_start(image)))
+                or (not self.starts and bool(self.planning.why_no_start(image)))
             )
         )
 
@@ -207,24 +130,12 @@ class Keeper:
         self._wake.set()
         return reason
 
-    def experience(self) -> Experience:
-        """Return what was learned, to be kept."""
-        return Experience(cold_ms=self.starts.costs.state(), planner=self._planner.state())
-
-    def recall(self, experience: Experience) -> None:
-        """Go on from what was learned before a restart; images that are gone are forgotten."""
-        known = set(self._images)
-        cold_ms = {image: seen for image, seen in experience.cold_ms.items() if image in known}
-        demand = {image: each for image, each in experience.planner.demand.items() if image in known}
-        self.starts.costs.restore(cold_ms)
-        self._planner.restore(msgspec.structs.replace(experience.planner, demand=demand), time.monotonic())
-
     # --- life -----------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
         """Connect to Podman and adopt what is there; whatever is missing then is worked on in the background."""
         await self.link.start(CONNECT_WAIT_S)
-        for work in (self._tend_forever(), self._memory.run()):
+        for work in (self._tend_forever(), self.planning.memory.run()):
             self._standing.append(asyncio.create_task(work, name=work.__qualname__))
 
     async def stop(self, *, keep_containers: bool, patience_s: float) -> None:
@@ -267,40 +178,6 @@ class Keeper:
         self._background.add(task)
         task.add_done_callback(self._background.discard)
 
-    # --- room -------------------------------------------------------------------------------------------------
-
-    def has_room(self, need: Need) -> bool:
-        """Whether there is room for one more container, if need be in place of an idle one."""
-        return self._room(self._size_mb(need), for_run=True) is not None
-
-    def _size_mb(self, need: Need) -> int:
-        return self._starter.size(need.image, need).memory_mb
-
-    def _view(self) -> View:
-        """Return what there is, as the planner sees it."""
-        return glance(
-            self.books,
-            self.starts.costs,
-            budget_mb=self._memory.squeeze.budget_mb,
-            capacity=self._config.capacity,
-            blocked=self.starts.problems(self._images),
-        )
-
-    def _room(self, memory_mb: int, *, for_run: bool) -> tuple[Retire, ...] | None:
-        """Return whom to give up for a container of this size; None when there is no room."""
-        return self._planner.room(self._view(), memory_mb, time.monotonic(), for_run=for_run)
-
-    def _image_of(self, retirement: Retire) -> str:
-        container = self.books.get(retirement.id)
-        return container.info.image if container is not None else ""
-
-    def _make_room(self, retirements: tuple[Retire, ...], view: View) -> None:
-        idle = {each.id: each for each in view.idle}
-        for each in retirements:
-            self._planner.evicted(idle[each.id], time.monotonic())
-            # Those who wait are served when the new one has its place, not in between.
-            self.give_up(each.id, each.why, serve=False)
-
     # --- starting ---------------------------------------------------------------------------------------------
 
     async def acquire(self, need: Need, turn: Turn | None = None) -> PooledContainer:
@@ -313,7 +190,7 @@ class Keeper:
         """
         if (container := self.books.take(need)) is not None:
             return container  # it came free meanwhile
-        self.check_startable(need, turn)
+        self.planning.check_startable(need, turn)
         container = self._begin(need)
         if container is None:
             container = await self.books.wait(need, turn)
@@ -329,14 +206,16 @@ class Keeper:
 
     def _begin(self, need: Need) -> PooledContainer | None:
         """Begin a start for one run; None when there is no room. Raises when a start would be in vain."""
-        view = self._view()
-        victims = self._planner.room(view, self._size_mb(need), time.monotonic(), for_run=True)
+        victims = self.planning.make_room(need)
         if victims is None:
             return None
-        self._check_image(need.image)
-        if victims and self._planner.weighed is not None:
-            self._on_evicted(self._planner.weighed)
-        self._make_room(victims, view)
+        self.planning.check_image(need.image)
+        if victims and self.planning.weighed is not None:
+            self._on_evicted(self.planning.weighed)
+        for idle, why in victims:
+            self.planning.evicted(idle)
+            # Those who wait are served when the new one has its place, not in between.
+            self.give_up(idle.id, why, serve=False)
         container = self._start(need.image, need, "a run waits for it")
         container.reservation = FOR_A_RUN
         return container
@@ -441,7 +320,7 @@ class Keeper:
 
     def _plan(self, now: float) -> None:
         """Carry out what the planner wants started and given up."""
-        starts, retirements = self._planner.tend(self._view(), now)
+        starts, retirements = self.planning.tend(now)
         for each in retirements:
             self.give_up(each.id, each.why, serve=False)
         for each in starts:
@@ -490,8 +369,3 @@ class Keeper:
             if not facts.limits_enforced:
                 log.warning("limits of containers are not enforced here", cgroup=facts.cgroup_version)
         self._wake.set()
-
-
-def _hour(now: float) -> float:
-    """Return the hour of the day (UTC) at a reading of the monotonic clock: what people do follows it."""
-    return (time.time() - (time.monotonic() - now)) / 3600.0 % 24.0

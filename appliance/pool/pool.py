@@ -123,7 +123,7 @@ class Pool:
             read_memory=read_memory,
             on_evicted=self._evicted,
         )
-        self._keepsake = Keepsake(store, recall=self._keeper.recall, tell=self._keeper.experience)
+        self._keepsake = Keepsake(store, recall=self._keeper.planning.recall, tell=self._keeper.planning.experience)
         self._runs = Runs(
             config,
             self._keeper,
@@ -144,7 +144,7 @@ class Pool:
     @property
     def squeeze(self) -> str:
         """Why the pool holds less than it is allowed, when the machine is short of memory; empty otherwise."""
-        return self._keeper.squeeze
+        return self._keeper.planning.squeeze
 
     @property
     def limits_enforced(self) -> bool:
@@ -223,7 +223,7 @@ class Pool:
             decision = self._choose(need, offers, facts)
         self._tell(decision, need, offers, facts)
         if decision.phase is Phase.COLD:
-            self._keeper.check_startable(need, turn)
+            self._keeper.planning.check_startable(need, turn)
         elif decision.phase is Phase.LOCAL_WARM and decision.container is not None:
             return msgspec.structs.replace(decision, reservation=self._keeper.books.reserve(decision.container))
         return decision
@@ -311,11 +311,11 @@ class Pool:
 
     def has_room(self, need: Need) -> bool:
         """Whether a container for a need could be started at once for a run that comes now: room, and no queue."""
-        return not self._keeper.books.queue and self._keeper.has_room(need)
+        return not self._keeper.books.queue and self._keeper.planning.has_room(need)
 
     def expected_s(self, position: int) -> float | None:
         """In how many seconds the run at a place in the queue (from 1) may have a container; None: not known."""
-        return self._keeper.expected_s(position)
+        return self._keeper.planning.expected_s(position)
 
     async def save(self, run_id: str) -> bool:
         """Ask a run's handler for a checkpoint now; False when there is none that could hear it."""

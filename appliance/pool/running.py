@@ -77,7 +77,7 @@ class Runs:
             raise RefusedError(f"run {request.run_id} is in progress here")
         run = self._runs[request.run_id] = _Run(turn)
         self._idle.clear()
-        self._keeper.arrived(request.need.image)
+        self._keeper.planning.arrived(request.need.image)
         try:
             async with contextlib.AsyncExitStack() as stack:
                 container, connection, phase = await self._place(request, decision, run, stack)
@@ -107,7 +107,7 @@ class Runs:
             if not self._runs:
                 self._idle.set()
             held_s = time.monotonic() - run.began if run.container is not None else 0.0
-            self._keeper.ended(request.need.image, held_s)
+            self._keeper.planning.ended(request.need.image, held_s)
 
     async def _place(
         self, request: RunRequest, decision: Decision, run: _Run, stack: contextlib.AsyncExitStack

@@ -65,7 +65,7 @@ class Verbs:
             )
         if why := self._no_warming():
             return Hinted(taken=False, why=why)
-        self._keeper.hinted(replace(hint, count=min(hint.count, self._config.capacity)))
+        self._keeper.planning.hinted(replace(hint, count=min(hint.count, self._config.capacity)))
         return Hinted(taken=True)
 
     async def warm(self, ask: WarmAsk) -> Warmed:
@@ -86,10 +86,10 @@ class Verbs:
         if why := self._no_warming():
             raise RefusedError(why)
         counted = self._count(ask.image)
-        if sum(counted) < ask.count and (why := self._keeper.why_no_start(ask.image)):
+        if sum(counted) < ask.count and (why := self._keeper.planning.why_no_start(ask.image)):
             self._refused["no room to warm"] += 1
             raise RefusedError(why, remedy="swiftbot pool evict something, raise pool.memory_mb, or wait")
-        self._keeper.hinted(PoolHint(image=ask.image, count=ask.count, keep_s=ask.keep_s, task=OPERATOR))
+        self._keeper.planning.hinted(PoolHint(image=ask.image, count=ask.count, keep_s=ask.keep_s, task=OPERATOR))
         if ask.wait_s:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(ask.wait_s):
@@ -97,7 +97,7 @@ class Verbs:
         ready, starting = self._count(ask.image)
         problem = ""
         if ready + starting < ask.count:
-            problem = self._keeper.why_no_start(ask.image) or "they are started as soon as others have been"
+            problem = self._keeper.planning.why_no_start(ask.image) or "they are started as soon as others have been"
         return Warmed(image=ask.image, ready=ready, starting=starting, problem=problem)
 
     async def evict(self, ask: EvictAsk) -> Evicted:

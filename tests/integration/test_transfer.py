@@ -15,10 +15,10 @@ from transfer_bench import Side, Sides, sides, small_image, tree
 
 from appliance.errors import CancelledByOperatorError, NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.plane.keys import Keys
+from appliance.pool.folders import LABEL_KEPT, podman_name
 from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.archive import Digests
 from appliance.pool.transfer.offers import Offer
-from appliance.pool.volumes import LABEL_KEPT, podman_name
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(300)]
 

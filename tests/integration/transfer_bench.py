@@ -14,10 +14,11 @@ from typing import Any
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
+from appliance.pool.folders import podman_name
 from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.settings import TransferConfig
 from appliance.pool.transfer.transfers import Transfers
-from appliance.pool.volumes import Volumes, podman_name
+from appliance.pool.volumes import Volumes
 
 
 class Side:

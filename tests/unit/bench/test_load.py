@@ -101,3 +101,14 @@ def test_the_account_of_a_rate() -> None:
     found = account([*served(9), Outcome(problem="refused")], Sampled(cpu=0.5, queue={"a": 0, "b": 2}))
     assert (found["start"]["count"], found["start"]["p50"], found["start"]["p99"]) == (10, 10.0, None)
     assert (found["unserved"], found["phases"], found["queue"]) == ({"refused": 1}, {"local warm": 9}, {"b": 2})
+
+
+def test_what_the_tail_is_made_of() -> None:
+    """Each phase has its own figures, and the slowest starts are told one by one with what their gateway took."""
+    slow = Outcome(started_ms=80.0, within_ms=75.0, ended_ms=90.0, asked="a", gateway="b", phase="remote warm")
+    found = account([*served(99), slow], Sampled())
+    assert found["ways"]["remote warm"]["within"]["max"] == 75.0
+    assert found["ways"]["local warm"]["start"]["count"] == 99
+    first = found["slowest"][0]
+    assert (first["start"], first["within"], first["asked"], first["ran_on"]) == (80.0, 75.0, "a", "b")
+    assert len(found["slowest"]) == 12

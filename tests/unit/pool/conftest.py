@@ -172,6 +172,30 @@ def skills_dir(short_dir: Path) -> Path:
 
 
 @pytest.fixture
+def growing(skills_dir: Path) -> Path:
+    """Add a skill whose runner takes 96 MB for itself as soon as the file exists that is returned."""
+    file = skills_dir.parent / "grow"
+    handler = f"""
+    import threading, time
+    from pathlib import Path
+
+    KEPT = []
+
+    def grow():
+        while not Path("{file}").exists():
+            time.sleep(0.01)
+        KEPT.append(b"x" * (96 * 2**20))
+
+    threading.Thread(target=grow, daemon=True).start()
+
+    def run(ctx):
+        return {{}}
+    """
+    write_skill(skills_dir, "growing", handler)
+    return file
+
+
+@pytest.fixture
 def catalogue(skills_dir: Path) -> Catalogue:
     """Return the real images with the test's skills only."""
     whole = load_catalogue([skills_dir])

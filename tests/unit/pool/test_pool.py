@@ -10,6 +10,7 @@ import pytest
 
 from appliance.errors import ConfigError, NotFoundError, PoolError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need, Phase, RunEventKind
+from appliance.pool.api import DecisionsAsk
 from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate, Decision
 from appliance.pool.settings import PressureConfig
@@ -281,6 +282,23 @@ async def test_used_up_containers_are_replaced(bench: Any) -> None:
         final, _ = await bench.run(pool, bench.request(number))
         seen.add(final.container)
     assert len(seen) == 2
+
+
+async def test_one_that_has_grown_is_replaced(growing: Path, bench: Any) -> None:
+    """A container whose runner has grown beyond what it may is replaced after a run, and the reason is told."""
+    pool = await bench.pool(floor={"base": 1}, capacity=1, max_growth_mb=64.0)
+    await bench.ready(pool, 1)
+    first, _ = await bench.run(pool, bench.request(1))
+    growing.touch()
+    number, last = 1, first
+    async with asyncio.timeout(30):
+        while last.container == first.container:  # until its probe has seen it
+            await bench.ready(pool, 1)
+            number += 1
+            last, _ = await bench.run(pool, bench.request(number))
+            assert last.kind is RunEventKind.SUCCEEDED
+    told = await pool.verbs.decisions(DecisionsAsk())
+    assert any("its runner has grown by" in each.why for each in told.decisions if each.container == first.container)
 
 
 async def test_idle_ones_beyond_the_floor_go(bench: Any) -> None:

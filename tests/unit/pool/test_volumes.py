@@ -11,12 +11,13 @@ from appliance.errors import ConflictError, NotFoundError, RefusedError, Unreach
 from appliance.model import VersionVector, VolumeInfo
 from appliance.plane.store import Store
 from appliance.plane.versions import Record, increment
+from appliance.pool.folders import LABEL_KEPT
 from appliance.pool.storage import FoundVolume, PodmanStorage
 from appliance.pool.transfer.archive import pack
 from appliance.pool.transfer.manifest import Manifest
 from appliance.pool.transfer.settings import TransferConfig
 from appliance.pool.transfer.swap import Place
-from appliance.pool.volumes import LABEL_KEPT, Volumes
+from appliance.pool.volumes import Volumes
 
 pytestmark = pytest.mark.anyio
 

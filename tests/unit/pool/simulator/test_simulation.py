@@ -1,10 +1,11 @@
 """The simulator: it counts right on traces worked out by hand, and shows what the policies are for."""
 
+import pytest
 from msgspec.structs import replace
 
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Arrival, Image, Outcome, Trace, simulate
-from appliance.pool.simulator.clairvoyant import Belady, least_cold
+from appliance.pool.simulator.clairvoyant import Belady, least_cold, least_cold_within
 from appliance.pool.simulator.simulation import REMOTE_MS, WARM_MS
 from appliance.pool.simulator.traces import plain
 
@@ -99,3 +100,37 @@ def test_no_policy_on_demand_beats_the_bound() -> None:
                 assert bound <= outcome.cold
     first = least_cold(trace, [0.0, 1e18])
     assert first[0] >= first[1] > 0
+
+
+def test_the_bound_within_a_budget_by_hand() -> None:
+    """Room for one: while `b` runs `a` cannot be kept, so every start is cold; room for two: the first of each."""
+    trace = trace_of((0.0, "a"), (10.0, "b"), (20.0, "a"), (30.0, "b"), duration_s=60.0)
+    assert least_cold_within(trace, [1024, 2048, 1e9]) == [4, 2, 2]
+
+
+@pytest.mark.parametrize("kind", ["poisson", "bursts", "timer"])
+def test_no_policy_on_demand_beats_the_bound_within_its_budget(kind: str) -> None:
+    """It holds for all that start on demand, crystal balls included, whatever the prices were moved to."""
+    trace = plain(kind, images=8, duration_s=3600.0, rate=0.3)
+    budgets = (1024, 2048, 4096)
+    for bound, rough, budget_mb in zip(
+        least_cold_within(trace, budgets), least_cold_within(trace, budgets, rounds=3), budgets, strict=True
+    ):
+        assert rough <= bound
+        for eviction in ("lru", "greedy-dual"):
+            settings = replace(BARE, memory_mb=budget_mb, eviction=eviction, idle_s=1e6)
+            for make in (
+                lambda _: None,
+                lambda gateway: Belady(trace, gateway),
+                lambda gateway: Belady(trace, gateway, by_number=True),
+            ):
+                assert bound <= simulate(trace, settings, make_evictor=make).cold
+
+
+def test_the_bound_falls_with_the_budget() -> None:
+    """More memory allows no more cold starts, down to the first on each level; without any, every run is one."""
+    trace = plain("poisson", images=6, duration_s=3600.0, rate=0.2)
+    bounds = least_cold_within(trace, [0, 512, 1024, 4096, 1e9])
+    assert bounds == sorted(bounds, reverse=True)
+    assert bounds[-1] == least_cold(trace, [1e18])[0]
+    assert bounds[0] >= 0.95 * len(trace.arrivals)
