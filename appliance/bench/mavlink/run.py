@@ -1,4 +1,4 @@
-"""A real vehicle's log through the gateway's router, at real time and at full speed, beside mavp2p in the same run.
+"""A real vehicle's log through the gateway's router, at real time and full speed, beside other routers in the same run.
 
 Vehicle and ground station are two TCP connections, so that nothing but the router can lose a frame: every good frame
 has to come out at the other side, byte for byte and in order, and stand in the recorder's file; damaged ones count.
@@ -6,8 +6,6 @@ has to come out at the other side, byte for byte and in order, and stand in the 
 
 import asyncio
 import contextlib
-import os
-import shutil
 import signal
 import socket
 import sys
@@ -24,7 +22,7 @@ import psutil
 from msgspec import Struct
 
 from appliance.bench.figures import ratio
-from appliance.bench.mavlink import tlog
+from appliance.bench.mavlink import others, tlog
 from appliance.bench.mavlink.host import FLEET, Host, Told
 from appliance.bench.mavlink.player import Play, Played, save
 from appliance.errors import PrerequisiteError
@@ -68,27 +66,13 @@ class Options(Struct, frozen=True, kw_only=True):
     """Seconds of the log that are played at real time; 0: all of it."""
     record: bool = True
     profile: bool = True
-    mavp2p: str = "auto"
-    """Path of the binary; `auto` looks in build/bin and PATH, `none` measures without it."""
-
-
-def find_mavp2p(wanted: str) -> str | None:
-    """Return the binary's path, None where it is not wanted; PrerequisiteError where it is not there."""
-    if wanted == "none":
-        return None
-    built = Path("build/bin/mavp2p")
-    found = wanted if wanted != "auto" else str(built) if built.is_file() else shutil.which("mavp2p")
-    if found is None or not os.access(found, os.X_OK):
-        raise PrerequisiteError(
-            "mavp2p, which is measured beside the router, is not there",
-            remedy="GOBIN=$PWD/build/bin go install github.com/bluenviron/mavp2p@latest, or --mavp2p none",
-        )
-    return found
+    beside: str = others.AUTO
+    """Routers of others that are measured too; see `others.find`."""
 
 
 async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
     """Measure; see the module."""
-    other = find_mavp2p(options.mavp2p)
+    found, missing = others.find(options.beside)
     records = tlog.read(Path(options.log)) if options.log else tlog.generate(options.frames)
     result: dict[str, Any] = {
         "log": Path(options.log).name or "generated",
@@ -108,14 +92,18 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
         if options.record:
             progress("the same, recorded")
             result["full_speed_recorded"] = await bench.gateway(records, speed=0.0, rounds=options.rounds, record=True)
-        if other is not None:
-            progress("the same through mavp2p")
-            result["mavp2p"] = await bench.mavp2p(other, records, rounds=options.rounds)
-            result["to_mavp2p"] = ratio(result["full_speed"]["frames_per_s"], result["mavp2p"]["frames_per_s"])
+        result["beside"] = {
+            name: {"missing": f"{name} is not installed", "remedy": how} for name, how in missing.items()
+        }
+        for each in found:
+            progress(f"the same through {each.other.name}")
+            its = await bench.other(each, records, rounds=options.rounds)
+            its["ours_to_its"] = ratio(result["full_speed"]["frames_per_s"], its["frames_per_s"])
+            result["beside"][each.other.name] = its
         if options.profile:
             progress("the same under the profiler")
-            found = await bench.gateway(records, speed=0.0, rounds=1, record=False, profile=True)
-            result["profile"] = found["profile"]
+            profiled = await bench.gateway(records, speed=0.0, rounds=1, record=False, profile=True)
+            result["profile"] = profiled["profile"]
     return result
 
 
@@ -193,19 +181,19 @@ class _Bench:
             found["profile"] = list(told.profile)
         return found
 
-    async def mavp2p(self, binary: str, records: Sequence[tlog.Record], *, rounds: int) -> dict[str, Any]:
-        """Play through mavp2p."""
+    async def other(self, found: others.Found, records: Sequence[tlog.Record], *, rounds: int) -> dict[str, Any]:
+        """Play through another router."""
         vehicle, ground = _free_ports(2)
-        folder = self._folder / "mavp2p"
+        folder = self._folder / found.other.name
         folder.mkdir()
-        endpoints = [f"tcps:127.0.0.1:{port}" for port in (vehicle, ground)]
-        async with _process("--hb-disable", *endpoints, program=binary) as process:
+        arguments = found.other.arguments(folder, (vehicle, ground))
+        async with _process(*arguments, program=found.path) as process:
             busy = psutil.Process(process.pid)
             played = await self._play(folder, records, (vehicle, ground), speed=0.0, rounds=rounds)
             used = busy.cpu_times()
-        found = self._compare(folder, records, played, rounds=rounds)
-        found["cpu_us_per_frame"] = round(1e6 * (used.user + used.system) / max(1, found["frames"]), 1)
-        return found
+        told = self._compare(folder, records, played, rounds=rounds)
+        told["cpu_us_per_frame"] = round(1e6 * (used.user + used.system) / max(1, told["frames"]), 1)
+        return told
 
     async def _play(
         self, folder: Path, records: Sequence[tlog.Record], ports: tuple[int, int], *, speed: float, rounds: int

@@ -17,13 +17,13 @@ def mavlink(
     real_s: float = 20.0,
     record: Annotated[bool, Parameter(help="Measure with a recorder too.")] = True,
     profile: Annotated[bool, Parameter(help="Show where the router's time goes.")] = True,
-    mavp2p: str = "auto",
+    beside: str = "auto",
     delivery: Annotated[bool, Parameter(negative="", help="Deliver tasks over a bad link instead.")] = False,
     tasks: int = 1000,
     loss: float = 0.2,
     as_json: Json = False,
 ) -> int:
-    """A vehicle's log through the router at real time and full speed, beside mavp2p: what arrives, what is recorded.
+    """A vehicle's log through the router at real time and full speed, beside others: what arrives, what is recorded.
 
     With --delivery: tasks asked for over a link that loses, doubles and reorders frames each way, on a real fleet.
 
@@ -32,7 +32,7 @@ def mavlink(
         frames: How many are generated.
         rounds: How often the log is played at full speed.
         real_s: Seconds of the log that are played at real time; 0 for all of it.
-        mavp2p: Path of mavp2p; `auto` looks in build/bin and PATH, `none` measures without it.
+        beside: Routers measured too, of mavp2p, mavrouter and mavproxy; `auto` is all that are installed, or `none`.
         tasks: Of --delivery: how many are asked for.
         loss: Of --delivery: share of datagrams lost, each way.
     """
@@ -46,7 +46,7 @@ def mavlink(
     from appliance.bench.mavlink.run import Options, run
 
     options = Options(
-        log=log, frames=frames, rounds=rounds, real_s=real_s, record=record, profile=profile, mavp2p=mavp2p
+        log=log, frames=frames, rounds=rounds, real_s=real_s, record=record, profile=profile, beside=beside
     )
     tell(measure(run(options, progress=say)), as_json=as_json)
     return 0
