@@ -11,7 +11,8 @@ from moving_bench import ended, fleet_of, pretty, until_running
 
 from appliance.client import FleetClient
 from appliance.errors import RefusedError
-from appliance.model import Plan, RobotCommand, Subtask, SubtaskState, TaskRequest, TaskState
+from appliance.local_fleet import FleetState
+from appliance.model import Plan, RobotCommand, Subtask, SubtaskRecord, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
 from appliance.tasks.migration.api import MigrateAsk
@@ -49,6 +50,21 @@ async def until_done(client: FleetClient, task: str, share: float) -> None:
             if found.state is SubtaskState.RUNNING and found.progress >= share:
                 return
     raise AssertionError(f"{task} ended before that")
+
+
+def done_of(log: Path, *verbs: str) -> Counter[tuple[str, str]]:
+    """How often robots did each command of those verbs, by task and the command's id."""
+    return Counter(
+        (command.task, command.id)
+        for message in read(log)
+        if message.key.endswith("/commanded")
+        and (command := msgspec.json.decode(message.payload, type=RobotCommand)).verb in verbs
+    )
+
+
+def log_of(state: FleetState) -> Path:
+    """The fleet's log."""
+    return max(Path(state.record_dir).glob("*.mcap"), key=lambda each: each.stat().st_size)
 
 
 async def test_a_film_and_a_patrol_go_on_at_another_gateway(tmp_path: Path) -> None:
@@ -97,14 +113,62 @@ async def test_a_film_and_a_patrol_go_on_at_another_gateway(tmp_path: Path) -> N
         assert abs(frames["count"] - PIECES * 5) <= 1, frames
         walked = records[1].of("s1").result or {}
         assert walked["laps"] == LAPS, walked
-    log = max(Path(state.record_dir).glob("*.mcap"), key=lambda each: each.stat().st_size)
-    done = Counter(
-        (command.task, command.id)
-        for message in read(log)
-        if message.key.endswith("/commanded")
-        and (command := msgspec.json.decode(message.payload, type=RobotCommand)).verb in ("record", "goto")
-    )
+    log = log_of(state)
+    done = done_of(log, "record", "goto")
     assert set(done.values()) == {1}, done
     assert Counter(task for task, _ in done) == {"t-film": PIECES, "t-patrol": LAPS}, done
+    report = replay(log)
+    assert report.same, [each.differences for each in report.tasks]
+
+
+async def until_told(client: FleetClient, task: str) -> SubtaskRecord:
+    """Wait until the record has a partial result of a task's first subtask, which runs."""
+    async with asyncio.timeout(120), aclosing(client.watch(task, poll_s=0.3)) as records:
+        async for record in records:
+            found = record.of("s1")
+            if found.state is SubtaskState.RUNNING and found.partial is not None:
+                return found
+    raise AssertionError(f"{task} ended before that")
+
+
+async def test_a_search_goes_on_at_another_gateway_with_what_it_has_seen(tmp_path: Path) -> None:
+    """Moved when its first view has shown nothing: the record keeps that, and no view is taken a second time.
+
+    From (10, 16) and from the point to the north a rack hides the pallet; to the east one cannot stand; from the point
+    to the south it is seen.
+    """
+    search = Plan(
+        domain="perception",
+        subtasks=(
+            Subtask(id="s1", skill="find", robot="rover_1", params={"target": "yellow pallet", "area": "10, 16"}),
+        ),
+    )
+    # At half the real speed there are seconds between two views.
+    pool = PoolConfig(floor={"base": 1, "vision": 1})
+    async with (
+        fleet_of(tmp_path, rovers=1, sim_rate=0.5, pool=pool) as state,
+        FleetClient(state.endpoint) as client,
+    ):
+        await client.submit(TaskRequest(instruction="find the yellow pallet", id="t-find", plan=search))
+        before = await until_told(client, "t-find")
+        told = before.partial or {}
+        assert (told["found"], told["views"]) == (False, len(told["looked_from"])), pretty(before)
+        assert await move(client, "t-find") in ("fresh", "last")
+        now = await until_running(client, "t-find", attempt=2)
+        kept = now.partial or {}
+        assert now.gateway != before.gateway
+        assert kept["looked_from"][: told["views"]] == told["looked_from"], pretty(now)
+        record = await ended(client, "t-find")
+        assert record.state is TaskState.SUCCEEDED, record.failure
+        found = record.of("s1")
+        assert (found.attempt, any(each.failure for each in found.attempts)) == (2, False), pretty(found)
+        result = found.result or {}
+        assert (result["found"], result["count"], result["views"], found.partial) == (True, 1, 3, None), result
+        assert result["looked_from"][: kept["views"]] == kept["looked_from"], result
+        assert [round(each["y"] - result["looked_from"][0]["y"], 1) for each in result["looked_from"]] == [0, 1.5, -1.5]
+    log = log_of(state)
+    for verb in ("capture", "goto"):
+        done = done_of(log, verb)
+        assert (set(done.values()), len(done)) == ({1}, 3), done
     report = replay(log)
     assert report.same, [each.differences for each in report.tasks]

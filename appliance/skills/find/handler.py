@@ -14,23 +14,27 @@ VIEWS = ((0.0, 1.0, "north"), (1.0, 0.0, "east"), (0.0, -1.0, "south"), (-1.0, 0
 
 
 def run(ctx: Context) -> dict[str, Any]:
-    """Return found, detections, the picture it was seen in, the robot's pose and the number of views."""
+    """Return found, detections, the picture it was seen in, and the points that it looked from."""
     target = params.text(ctx, "target")
     if not colours.wanted(target, ctx.site).sure:
         raise ctx.Fail(f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'")
     speed = moves.speed(ctx)
     saved = ctx.resume or {}
+    looked = params.rows(saved.get("looked_from"))
     if saved:
-        start, begin, views = (float(saved["x"]), float(saved["y"])), int(saved["next"]), int(saved["views"])
+        start, begin = (float(saved["x"]), float(saved["y"])), int(saved["next"])
     else:
         if "area" in ctx.params:
             moves.go(ctx, [resolve(ctx, params.text(ctx, "area"))], speed_mps=speed, share=0.2)
         here = moves.state(ctx)
-        start, begin, views = (here.x, here.y), 0, 0
+        start, begin = (here.x, here.y), 0
     x, y = start
-    spots = [None, *(Spot(f"a view from the {side}", x + STEP_M * dx, y + STEP_M * dy) for dx, dy, side in VIEWS)]
+    spots = [
+        Spot("here", x, y),
+        *(Spot(f"a view from the {side}", x + STEP_M * dx, y + STEP_M * dy) for dx, dy, side in VIEWS),
+    ]
     for number, spot in enumerate(spots[begin:], start=begin):
-        if spot is not None:
+        if number:
             if _closed(ctx, spot):
                 # The calls of a view that is left out are made up for, so that later ones keep their numbers.
                 for _ in range(CALLS_A_VIEW):
@@ -38,21 +42,24 @@ def run(ctx: Context) -> dict[str, Any]:
                 continue
             moves.go(ctx, [spot], speed_mps=speed, done=0.2 + 0.15 * number, share=0.05)
         data, about = pictures.take(ctx, target)
-        views += 1
+        looked = [*looked, {"x": round(spot.x, 2), "y": round(spot.y, 2)}]
+        views = len(looked)
         picture = colours.decode(ctx, data, f"view {views}")
         rows = colours.detections(picture, target, ctx.site)
         ctx.progress(0.3 + 0.15 * number, f"view {views}: {len(rows)} seen")
+        so_far: dict[str, Any] = {"found": bool(rows), "target": target, "views": views, "looked_from": looked}
         if rows:
             image = pictures.keep(ctx, target, data, views)
             marked = ctx.put_artifact(
                 f"{params.slug(target)}-marked.png", colours.annotated(picture, rows), "image/png"
             )
             rows = [{**row, "image": image["artifact"]} for row in rows]
-            seen = {"found": True, "target": target, "detections": rows, "count": looking.most_in_one(rows)}
-            return {**seen, "image": image, "annotated": [marked], "views": views, "camera": about}
+            seen = {"detections": rows, "count": looking.most_in_one(rows), "image": image, "annotated": [marked]}
+            return {**so_far, **seen, "camera": about}
         # Nothing here: an attempt on another gateway goes on with the next view.
-        ctx.checkpoint({"x": x, "y": y, "next": number + 1, "views": views})
-    raise ctx.Fail(f"{target} was not seen from {views} points", "look in another area: name it as `area`")
+        ctx.checkpoint({"x": x, "y": y, "next": number + 1, "looked_from": looked})
+        ctx.partial(so_far)
+    raise ctx.Fail(f"{target} was not seen from {len(looked)} points", "look in another area: name it as `area`")
 
 
 def _closed(ctx: Context, spot: Spot) -> bool:

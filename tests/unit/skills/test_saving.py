@@ -64,4 +64,22 @@ def test_find_goes_on_with_the_next_view(
     assert first.sent("goto")[:1] + second.sent("goto") == whole.sent("goto")
     third = make_ctx(target="red box")
     third.resume, third.picture = second.resume, picture(("red", (100, 100, 60, 60)))
-    assert handler("find").run(third)["views"] == 3
+    found = handler("find").run(third)
+    assert (found["views"], found["looked_from"]) == (3, whole.partials[2]["looked_from"])
+
+
+def test_what_find_tells_so_far_counts_the_views_before_a_move(make_ctx: Make, handler: Load, leave: Leave) -> None:
+    """Each view that showed nothing is told at once; the next attempt tells those of the one before among its own."""
+    first, second, whole = (make_ctx(target="red box") for _ in range(3))
+    for each in (first, whole):
+        each.info["pose"] = {"x": 16.0, "y": 12.0}
+    with pytest.raises(whole.Fail):
+        handler("find").run(whole)
+    second.resume = leave(handler("find").run, first, 2)
+    second.info["pose"] = first.info["pose"]
+    with pytest.raises(second.Fail):
+        handler("find").run(second)
+    # The second attempt ends the first in the middle of its second view: that is saved, and not told.
+    assert first.partials + second.partials == [whole.partials[0], *whole.partials[2:]]
+    assert [len(each["looked_from"]) for each in whole.partials] == [each["views"] for each in whole.partials]
+    assert not any(each["found"] for each in whole.partials)
