@@ -29,8 +29,9 @@ _PAGE = 4000
 """Digests in one answer: at most about 2 MB."""
 _FETCH_BYTES = 2 * 2**20
 """Values in one answer, unless a single one is larger."""
-_SEE_S = 1.0
-"""How long a member waits to see the token of the one that asks."""
+SEE_S = 0.7
+"""How long a member waits to see the token of the one that asks: shorter than any question lasts (also those after a
+loss, `reconcile`), or whoever is not seen would never hear so, and show its token again."""
 
 
 class DigestAsk(Struct, frozen=True, omit_defaults=True):
@@ -206,7 +207,7 @@ class Comparing:
     async def _is_seen(self, asker: str) -> bool:
         """Wait until the asker is seen: from then on this gateway orders no writes of keys that the asker owns."""
         try:
-            async with asyncio.timeout(_SEE_S), self._seen:
+            async with asyncio.timeout(SEE_S), self._seen:
                 await self._seen.wait_for(lambda: self._membership.sees(asker))
         except TimeoutError:
             return False

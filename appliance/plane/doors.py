@@ -10,6 +10,7 @@ wrong one, and say that it is somebody else. So nobody's word breaks a link that
 - where there is something between the two, the link that is mixed up is not known. Then all of Zenoh's links of this
   process are made anew, but only when two different sessions have met a wrong door here within a minute: one is not
   believed, and an attempt that fails for such a reason is made by another gateway next.
+- whoever *finds by itself* that links of its own cannot be right (`outlived`) makes all of them anew: nobody said so.
 """
 # pyright: reportUnknownMemberType=false
 
@@ -56,6 +57,11 @@ class Mixups:
         self._seen.clear()
         return True
 
+    def renewed(self, now: float) -> None:
+        """All links are made anew, for another reason."""
+        self._broken[""] = now
+        self._seen.clear()
+
     def _calm(self, link: str, now: float) -> bool:
         if now < self._broken.get(link, -CALM_S) + CALM_S:
             return False
@@ -87,6 +93,11 @@ class Doors:
         elif self._mixups.relayed(replier, self._wire.loop.time()):
             self._soon("")
 
+    def renew(self, why: str) -> None:
+        """Make all links anew; `why` is for the log."""
+        self._mixups.renewed(self._wire.loop.time())
+        self._break("", why)
+
     def _links(self, other: str) -> list[tuple[str, str]]:
         """Ends of the links with a session, or of all for the empty name."""
         if self._wire.closed:
@@ -95,12 +106,10 @@ class Doors:
         return [(each.src, each.dst) for each in found if not other or str(each.zid) == other]
 
     def _soon(self, other: str) -> None:
-        self._wire.loop.call_later(_AFTER_ANSWER_S, self._break, other)
+        self._wire.loop.call_later(_AFTER_ANSWER_S, self._break, other, "questions arrived at wrong doors")
 
-    def _break(self, other: str) -> None:
+    def _break(self, other: str, why: str) -> None:
         ends = [(address_of(one), address_of(another)) for one, another in self._links(other)]
         broken = self._sockets.shut({(one, another) for one, another in ends if one and another})
         if broken:
-            log.warning(
-                "links are made anew, since questions arrived at wrong doors", links=broken, other=other or "all"
-            )
+            log.warning("links are made anew", why=why, links=broken, other=other or "all")

@@ -11,6 +11,7 @@ import structlog
 
 from appliance.errors import PayloadError
 from appliance.plane.keys import check_name
+from appliance.plane.pulse import clock
 from appliance.plane.ring import Ring
 from appliance.plane.session import Closer, Session
 
@@ -34,6 +35,8 @@ class Membership:
         self.on_lost: list[Callable[[str], None]] = []
         self._tokens: dict[str, set[str]] = {}
         """Name -> keys of the tokens seen."""
+        self._since: dict[str, float] = {}
+        """Name -> since when a token of it has been seen without a break, by the pulse's clock."""
         self._watches: list[Closer] = []
         self._token: Closer | None = None
         self._again: Closer | None = None
@@ -55,6 +58,10 @@ class Membership:
     def sees(self, name: str) -> bool:
         """Whether a gateway counts as there for its questions about records."""
         return name in self._members
+
+    def seen_since(self, moment: float) -> frozenset[str]:
+        """The other members whose token was there at a moment of the pulse's clock and has never gone since."""
+        return frozenset(name for name, at in self._since.items() if at <= moment)
 
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
@@ -107,7 +114,9 @@ class Membership:
             self._session.refuse("too many gateways", key=key)
             return
         if alive:
-            self._tokens[name] = {key}
+            self._tokens[name], self._since[name] = {key}, clock()
+        else:
+            self._since.pop(name, None)
         self._members = self._members | {name} if alive else self._members - {name}
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
         self._tell(self.on_joined if alive else self.on_lost, name)

@@ -17,6 +17,7 @@ from appliance.plane.browsing import Browsing
 from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
+from appliance.plane.outlived import Outlived
 from appliance.plane.pulse import Pulse
 from appliance.plane.quorum.forgetting import Forgetting
 from appliance.plane.quorum.voting import Voting
@@ -69,6 +70,9 @@ class Plane:
         self._membership = _membership(config, session, self.rpc, gateway)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
+        self._outlived = Outlived(
+            self._pulse, lease_s=config.lease_ms / 1e3, members=self._membership, renew=session.renew_links
+        )
         self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self._forgetting = Forgetting(self._voting, gateway=gateway, store=store, kept_hours=config.tombstone_hours)
         self.dht = Dht(
@@ -243,6 +247,7 @@ class Plane:
 
     async def close(self) -> None:
         """Leave the fleet and close the store; more than once does no harm."""
+        await self._outlived.close()
         await self._membership.leave()
         self._membership.close()
         await self._reconciler.close()

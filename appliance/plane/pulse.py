@@ -11,21 +11,29 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import structlog
 
 log = structlog.get_logger(__name__)
 
 
-def _clock() -> float:
+def clock() -> float:
     """Seconds, those of a suspended machine among them."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+class Standstill(NamedTuple):
+    """When a process stood still: since what moment of `clock`, and for how many seconds."""
+
+    since: float
+    lasted_s: float
 
 
 class Pulse:
     """Beats on a thread of its own: what only holds up the event loop makes nobody take this gateway for dead."""
 
-    def __init__(self, lease_s: float, *, clock: Callable[[], float] = _clock) -> None:
+    def __init__(self, lease_s: float, *, clock: Callable[[], float] = clock) -> None:
         self.on_stalled: list[Callable[[], None]] = []
         """Called on the event loop after the process stood still."""
         self._lease_s = lease_s
@@ -34,6 +42,8 @@ class Pulse:
         self._last = clock()
         self._until = self._last
         self._stalls = 0
+        self.last_standstill = Standstill(self._last, 0.0)
+        """The one that `on_stalled` was told of last."""
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -64,12 +74,13 @@ class Pulse:
         """Look at the clock, from any thread; whoever does so first after a stall finds it."""
         with self._lock:
             now = self._clock()
-            stood_s, self._last = now - self._last, now
+            since, stood_s, self._last = self._last, now - self._last, now
             # Silent for a quarter of a lease before it stopped: the others may know after three more.
             stalled = self._thread is not None and stood_s >= self._lease_s * 0.75
             if stalled:
                 self._until = now + self._lease_s
                 self._stalls += 1
+                self.last_standstill = Standstill(since, stood_s)
         if stalled:
             log.warning("this process stood still; it may have been succeeded", seconds=round(stood_s, 3))
             # The loop may be gone when the process ends without closing: then nobody listens.

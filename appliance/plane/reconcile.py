@@ -27,7 +27,7 @@ from appliance.plane.store import Store
 
 log = structlog.get_logger(__name__)
 
-_LOSS_ASK_S = 1.0
+LOSS_ASK_S = 1.0
 """One question while somebody waits for a lost member's keys: all that are asked see this gateway already."""
 _AGAIN_S = 1.0
 """After a member could not be compared with."""
@@ -173,7 +173,7 @@ class Reconciler:
 
     async def _round(self, step: Step, *, tidy: bool) -> _Done:
         if step.kind is not Kind.REST:
-            ask_s = _LOSS_ASK_S if step.kind is Kind.LOSS else ASK_S
+            ask_s = LOSS_ASK_S if step.kind is Kind.LOSS else ASK_S
             heard, fetched = await self._comparing.compare(step.ring, step.asked, ask_s=ask_s)
             return _Done(heard, handed=True, fetched=fetched)
         heard, fetched = await self._comparing.compare(step.ring, () if tidy else step.asked)

@@ -58,6 +58,7 @@ class Session:
         self.declare_alive = presence.declare_alive
         self.alive_now = presence.alive_now
         self.watch_alive = presence.watch_alive
+        self.renew_links = doors.renew
 
     @classmethod
     async def open(cls, config: PlaneConfig, fleet: str) -> "Session":

@@ -107,3 +107,16 @@ async def test_who_asked_makes_that_one_link_anew(three: tuple[Session, Session,
     assert await _ask(hub, "swiftbot/f/one") == b"x"
     assert _links(other) == at_other
     assert await hub.query("swiftbot/f/other", b"y", timeout_s=5) == b"y"
+
+
+async def test_whoever_doubts_its_own_links_makes_all_of_them_anew(three: tuple[Session, Session, Session]) -> None:
+    """After that the others are linked as before, by other links, and are answered."""
+    hub, one, other = three
+    hub.serve("swiftbot/f/q", _echo)
+    assert await _ask(one, "swiftbot/f/q") == b"x"
+    before = _links(hub)
+    assert len(before) == 2
+    hub.renew_links("a test does so")
+    await _until(lambda: len(_links(hub)) == 2 and not _links(hub) & before)
+    for each in (one, other):
+        assert await _ask(each, "swiftbot/f/q") == b"x"

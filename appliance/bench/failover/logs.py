@@ -10,7 +10,8 @@ from typing import Any
 
 from appliance.errors import DeadlineError
 
-_LOOK_S = 0.005
+LOOK_S = 0.005
+"""Between two looks at a file."""
 
 
 class LogTail:
@@ -47,22 +48,14 @@ class LogTail:
 
     async def until(self, wanted: Callable[[dict[str, Any]], bool], what: str, *, wait_s: float) -> dict[str, Any]:
         """The next line that is wanted, without those before it; DeadlineError, which says `what`, after `wait_s`."""
-        return (await self.up_to(wanted, what, wait_s=wait_s))[-1]
-
-    async def up_to(
-        self, wanted: Callable[[dict[str, Any]], bool], what: str, *, wait_s: float
-    ) -> list[dict[str, Any]]:
-        """The same with those before it."""
         give_up = time.monotonic() + wait_s
-        found: list[dict[str, Any]] = []
         while time.monotonic() < give_up:
             lines = self.read()
             for number, line in enumerate(lines):
                 if wanted(line):
                     self._unread = lines[number + 1 :]
-                    return [*found, *lines[: number + 1]]
-            found += lines
-            await asyncio.sleep(_LOOK_S)
+                    return line
+            await asyncio.sleep(LOOK_S)
         raise DeadlineError(f"{what}: not in {self._path} within {wait_s:g} s", remedy="see the end of that file")
 
 

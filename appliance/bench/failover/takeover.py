@@ -1,9 +1,9 @@
 """Gateways that coordinate running tasks are killed, and frozen: how soon it is noticed, and who goes on.
 
 A killed process is noticed by its connections, at once; a frozen one (SIGSTOP, a machine that hangs) by its silence,
-after `plane.lease_ms`. Survivors say in their logs when they lost it; the successor's transition `adopted` says that
-it drives the task, once the record with it is written. In the end each task must have succeeded, and each subtask
-must have ended exactly once.
+after `plane.lease_ms`. Survivors say in their logs when they lost it, and the successor when the record is written by
+which it drives the task: a client that was linked to the lost one hears nothing at just that moment. In the end each
+task must have succeeded, and each subtask must have ended exactly once.
 """
 
 import asyncio
@@ -11,14 +11,14 @@ import signal
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from msgspec import Struct
 
 from appliance.bench.chaos.arena import Arena, Progress, loopback
-from appliance.bench.failover.logs import LogTail, wall_s
+from appliance.bench.failover.logs import LOOK_S, LogTail, wall_s
 from appliance.bench.figures import summary
 from appliance.bench.pooled import SKILL, fleet_name, write_skill
 from appliance.client import FleetClient
@@ -55,37 +55,70 @@ class Options(Struct, frozen=True, kw_only=True):
 
 
 class Heard:
-    """The transitions of all tasks as they are published, with when they came."""
+    """Which subtasks have succeeded, as it is published: heard by several clients, each linked to another gateway.
 
-    def __init__(self, client: FleetClient) -> None:
-        self.all: list[tuple[float, Transition]] = []
-        self.came = asyncio.Event()
-        session = client.plane.session
-        self._closer = session.subscribe_typed(session.keys.transition(), Transition, self._take)
+    What is published while a client's own gateway is lost, and until it is linked to the next, that client misses.
+    """
+
+    def __init__(self, clients: Sequence[FleetClient]) -> None:
+        self._ended: set[tuple[str, str, int, str]] = set()
+        self._closers = [
+            client.plane.session.subscribe_typed(client.plane.session.keys.transition(), Transition, self._take)
+            for client in clients
+        ]
 
     def _take(self, _: str, transition: Transition | None) -> None:
-        if transition is not None:
-            self.all.append((time.time(), transition))
-            self.came.set()
-
-    def adopted(self, task: str, not_by: str) -> tuple[float, Transition] | None:
-        """When a task was first taken over by another gateway, on the wall clock of this machine."""
-        for at, each in self.all:
-            if each.task == task and each.kind is TransitionKind.ADOPTED and each.coordinator != not_by:
-                return at, each
-        return None
+        if transition is not None and transition.kind is TransitionKind.SUCCEEDED:
+            each = transition
+            self._ended.add((each.task, each.subtask, each.sequence, each.coordinator))
 
     def ends(self, tasks: Sequence[str]) -> Counter[tuple[str, str]]:
         """How often each subtask of these tasks has succeeded."""
-        return Counter(
-            (each.task, each.subtask)
-            for _, each in self.all
-            if each.task in tasks and each.kind is TransitionKind.SUCCEEDED
-        )
+        return Counter((task, subtask) for task, subtask, _, _ in self._ended if task in tasks)
 
     def close(self) -> None:
         """Listen no more."""
-        self._closer.close()
+        for closer in self._closers:
+            closer.close()
+
+
+class Adoption(Struct, frozen=True, kw_only=True):
+    """A takeover of a task, as the successor's log tells it; times are Unix seconds."""
+
+    by: str
+    at: float
+    """When the record with the new coordinator was written."""
+    wrote_ms: float
+    settled: tuple[float, ...]
+    """When shards were compared for a loss, before it."""
+
+    def parts(self, seen_at: float) -> dict[str, float]:
+        """What the time since the loss was seen went into, ms.
+
+        `settled`: its shard compared with the others'; `taken_up`: until the driver of the task began to write;
+        `written`: the record with the new coordinator.
+        """
+        settled_at = next((each for each in self.settled if each >= seen_at), seen_at)
+        return {
+            "settled": (settled_at - seen_at) * 1e3,
+            "taken_up": max(0.0, (self.at - settled_at) * 1e3 - self.wrote_ms),
+            "written": self.wrote_ms,
+        }
+
+
+def adoptions(lines: Mapping[str, Sequence[dict[str, Any]]], victim: str) -> dict[str, Adoption]:
+    """The first takeover of each task from a gateway; `lines` of logs since then, by gateway."""
+    found: dict[str, Adoption] = {}
+    for name, log in lines.items():
+        settled: list[float] = []
+        for line in log:
+            if line.get("event") == "shard settled" and line.get("why") == "loss":
+                settled.append(wall_s(line))
+            elif line.get("event") == "task adopted" and line.get("before") == victim:
+                task, at = str(line["task"]), wall_s(line)
+                if task not in found or at < found[task].at:
+                    found[task] = Adoption(by=name, at=at, wrote_ms=float(line["wrote_ms"]), settled=tuple(settled))
+    return found
 
 
 async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
@@ -93,7 +126,7 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 
     Returns:
         For `kill` and `freeze`: `detected` by the successor and `detected_by_all`, ms after the signal; `adopted`, ms
-        after the successor's detection, and the parts of that (`settled`, `written`); and counts of tasks.
+        after the successor's detection, and the parts of that (`settled`, `taken_up`, `written`); and counts of tasks.
     """
     result: dict[str, Any] = {"gateways": options.gateways, "lease_ms": options.lease_ms, "goal_ms": GOAL_MS}
     with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
@@ -107,8 +140,11 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
         )  # fmt: skip
         try:
             await arena.start_all(progress=progress, ready=1)
-            async with await arena.client() as client:
-                rounds = _Rounds(options, arena, client, progress)
+            # Each takes the first endpoint that answers: with one gateway lost at a time never the same one.
+            half = len(arena.endpoints) // 2
+            turned = (*arena.endpoints[half:], *arena.endpoints[:half])
+            async with await arena.client() as client, await arena.client(turned) as other:
+                rounds = _Rounds(options, arena, (client, other), progress)
                 if options.kills:
                     result["kill"] = await rounds.run("kill", options.kills)
                 if options.freezes:
@@ -119,17 +155,16 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 
 
 class _Rounds:
-    def __init__(self, options: Options, arena: Arena, client: FleetClient, progress: Progress) -> None:
+    def __init__(self, options: Options, arena: Arena, clients: Sequence[FleetClient], progress: Progress) -> None:
         self._options = options
         self._arena = arena
-        self._client = client
+        self._client = clients[0]
+        self._clients = clients
         self._progress = progress
-        self._lines: dict[LogTail, list[dict[str, Any]]] = {}
-        """What was read of a log after a loss."""
 
     async def run(self, how: Literal["kill", "freeze"], rounds: int) -> dict[str, Any]:
         """Lose so many coordinators, one after the other."""
-        heard = Heard(self._client)
+        heard = Heard(self._clients)
         detected: list[float] = []
         by_all: list[float] = []
         adopted: list[float] = []
@@ -147,7 +182,6 @@ class _Rounds:
                 for name in self._arena.names
                 if name != victim
             }
-            self._lines.clear()
             at = time.time()
             if how == "kill":
                 await self._arena.kill(victim)
@@ -155,12 +189,11 @@ class _Rounds:
                 self._arena.signal(victim, signal.SIGSTOP)
             lost = await self._lost(tails, victim)
             by_all.append((max(lost.values()) - at) * 1e3)
-            for task in theirs:
-                adopted_at, transition = await self._adopted(heard, task, victim)
-                seen_at = lost[transition.coordinator]
+            for each in (await self._adopted(tails, theirs, victim)).values():
+                seen_at = lost[each.by]
                 detected.append((seen_at - at) * 1e3)
-                adopted.append((adopted_at - seen_at) * 1e3)
-                for part, took_ms in (await self._parts(tails[transition.coordinator], task, seen_at)).items():
+                adopted.append((each.at - seen_at) * 1e3)
+                for part, took_ms in each.parts(seen_at).items():
                     parts[part].append(took_ms)
             self._progress(
                 f"{how} {number + 1} of {rounds}: {victim} with {len(theirs)} tasks, seen after {by_all[-1]:.0f} ms, "
@@ -226,42 +259,23 @@ class _Rounds:
         )
         return {name: wall_s(line) for name, line in zip(tails, lines, strict=True)}
 
-    async def _adopted(self, heard: Heard, task: str, victim: str) -> tuple[float, Transition]:
-        try:
-            async with asyncio.timeout(STEP_S):
-                while (found := heard.adopted(task, victim)) is None:
-                    heard.came.clear()
-                    await heard.came.wait()
-        except TimeoutError:
-            raise DeadlineError(f"nobody took {task} over from {victim} within {STEP_S:g} s") from None
-        return found
-
-    async def _parts(self, tail: LogTail, task: str, seen_at: float) -> dict[str, float]:
-        """What the time between the loss and the takeover of a task went into, by the successor's own log.
-
-        `settled`: its shard compared with the others'; `taken_up`: until the driver of the task began to write;
-        `written`: the record with the new coordinator.
-        """
-        lines = self._lines.setdefault(tail, [])
-
-        def is_adoption(line: dict[str, Any]) -> bool:
-            return line.get("event") == "task adopted" and line.get("task") == task
-
-        if not any(is_adoption(line) for line in lines):
-            lines += await tail.up_to(is_adoption, f"{task} adopted", wait_s=STEP_S)
-        adopted = next(line for line in lines if is_adoption(line))
-        at, wrote_ms = wall_s(adopted), float(adopted["wrote_ms"])
-        settled = [
-            wall_s(line)
-            for line in lines
-            if line.get("event") == "shard settled" and line.get("why") == "loss" and seen_at <= wall_s(line) <= at
-        ]
-        settled_at = settled[0] if settled else seen_at
-        return {
-            "settled": (settled_at - seen_at) * 1e3,
-            "taken_up": max(0.0, (at - settled_at) * 1e3 - wrote_ms),
-            "written": wrote_ms,
-        }
+    async def _adopted(self, tails: dict[str, LogTail], tasks: list[str], victim: str) -> dict[str, Adoption]:
+        """Wait until each of these tasks has been taken over, by the successors' own logs."""
+        lines: dict[str, list[dict[str, Any]]] = {name: [] for name in tails}
+        give_up = time.monotonic() + STEP_S
+        while True:
+            for name, tail in tails.items():
+                lines[name] += tail.read()
+            found = adoptions(lines, victim)
+            missing = [task for task in tasks if task not in found]
+            if not missing:
+                return {task: found[task] for task in tasks}
+            if time.monotonic() > give_up:
+                raise DeadlineError(
+                    f"nobody took {', '.join(missing)} over from {victim} within {STEP_S:g} s",
+                    remedy="see the gateways' logs",
+                )
+            await asyncio.sleep(LOOK_S)
 
     async def _ended(self, heard: Heard, names: list[str]) -> list[str]:
         """Wait for the end of all tasks; returns those that did not succeed once and for all."""

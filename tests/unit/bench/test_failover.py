@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from appliance.bench.failover.logs import LogTail, wall_s
+from appliance.bench.failover.takeover import adoptions
 from appliance.errors import DeadlineError
 
 pytestmark = pytest.mark.anyio
@@ -36,3 +37,27 @@ async def test_a_file_that_comes_later_is_read_from_its_beginning(tmp_path: Path
     (tmp_path / "gw.log").write_text(json.dumps(line) + "\n")
     (found,) = tail.read()
     assert wall_s(found) == pytest.approx(1795299653.5)
+
+
+def test_takeovers_are_read_from_the_successors_logs() -> None:
+    """The first from the one that was lost counts, with what the time went into; those from others do not."""
+
+    def line(second: float, event: str, **fields: object) -> dict[str, object]:
+        return {"timestamp": f"2026-11-21T22:20:{second:06.3f}Z", "event": event, **fields}
+
+    lines = {
+        "gw-1": [
+            line(10.1, "shard settled", why="arrival"),
+            line(10.2, "shard settled", why="loss"),
+            line(10.25, "task adopted", task="t-1", before="gw-2", wrote_ms=20.0),
+            line(10.3, "task adopted", task="t-2", before="gw-3", wrote_ms=5.0),
+            line(11.0, "task adopted", task="t-3", before="gw-2", wrote_ms=5.0),
+        ],
+        "gw-3": [line(10.5, "task adopted", task="t-3", before="gw-2", wrote_ms=7.0)],
+    }
+    found = adoptions(lines, "gw-2")
+    assert {task: each.by for task, each in found.items()} == {"t-1": "gw-1", "t-3": "gw-3"}
+    seen_at = wall_s(line(10.05, ""))
+    assert found["t-1"].parts(seen_at) == pytest.approx({"settled": 150.0, "taken_up": 30.0, "written": 20.0}, abs=0.1)
+    # A shard that was compared before the loss was seen is not what it waited for.
+    assert found["t-3"].parts(seen_at) == pytest.approx({"settled": 0.0, "taken_up": 443.0, "written": 7.0}, abs=0.1)
