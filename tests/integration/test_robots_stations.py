@@ -355,15 +355,46 @@ async def test_mavproxy_as_a_router_in_between(field: Field, free_ports: Ports) 
         await router.close()
 
 
-@pytest.mark.skipif(
-    shutil.which("mavp2p") is None,
-    reason="mavp2p is not installed: `go install github.com/bluenviron/mavp2p@latest` and put it on the PATH",
+def _mavp2p(_: Path, stations: int, port: int) -> list[str]:
+    return ["mavp2p", f"tcpc:127.0.0.1:{stations}", f"udps:127.0.0.1:{port}"]
+
+
+def _mavrouter(folder: Path, stations: int, port: int) -> list[str]:
+    ends = (("tcp", stations, "client"), ("udp", port, "server"))
+    config = folder / "mavrouter.toml"
+    config.write_text(
+        f"[general]\nlog = {json.dumps(str(folder))}\nlog_telemetry = false\n"
+        + "".join(
+            f'[[endpoint]]\ntype = "{kind}"\naddress = "127.0.0.1:{number}"\nmode = "{mode}"\n'
+            for kind, number, mode in ends
+        )
+    )
+    return ["mavrouter", "--config", str(config)]
+
+
+def _where_installed(program: str, how: str) -> pytest.MarkDecorator:
+    reason = f"{program} is not installed: `{how}` and put it on the PATH"
+    return pytest.mark.skipif(shutil.which(program) is None, reason=reason)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(
+            _mavp2p, marks=_where_installed("mavp2p", "go install github.com/bluenviron/mavp2p@latest"), id="mavp2p"
+        ),
+        pytest.param(
+            _mavrouter, marks=_where_installed("mavrouter", "cargo install mavrouter --locked"), id="mavrouter"
+        ),
+    ],
 )
-async def test_mavp2p_as_a_router_in_between(field: Field, free_ports: Ports) -> None:
-    """A station behind mavp2p arms the vehicle behind the gateway."""
+async def test_another_router_in_between(
+    field: Field, free_ports: Ports, tmp_path: Path, command: Callable[[Path, int, int], list[str]]
+) -> None:
+    """A station behind a router of others arms the vehicle behind the gateway."""
     await field.vehicle()
     (port,) = free_ports(1, udp=True)
     quiet = {"stdout": asyncio.subprocess.DEVNULL, "stderr": asyncio.subprocess.DEVNULL}
-    await field.start("mavp2p", f"tcpc:127.0.0.1:{field.stations}", f"udps:127.0.0.1:{port}", **quiet)
+    await field.start(*command(tmp_path, field.stations, port), **quiet)
     assert await asyncio.to_thread(_arm_through, f"udpout:127.0.0.1:{port}") == 0
     await until(lambda: field.infos[-1].armed)
