@@ -57,28 +57,47 @@ def inside(box: Box, x: float, y: float, margin: float = 0.0) -> bool:
     return box.x[0] - margin < x < box.x[1] + margin and box.y[0] - margin < y < box.y[1] + margin
 
 
-def crosses(box: Box, start: tuple[float, float], end: tuple[float, float], margin: float = -0.05) -> bool:
-    """Tell whether a straight leg passes through the inside of a box (Liang-Barsky clipping).
+def core(box: Box, rim_m: float) -> Box:
+    """Return a box without a rim of `rim_m` metres; of a narrow one the middle half of its width is kept.
 
-    The default margin lets a leg graze the edge, so that a planner that keeps to the edge is not refused.
+    So an edge may be grazed, and yet no wall is so thin that nothing of it is in the way.
     """
+
+    def middle(low: float, high: float) -> tuple[float, float]:
+        rim = min(rim_m, (high - low) / 4)
+        return low + rim, high - rim
+
+    return Box(name=box.name, x=middle(*box.x), y=middle(*box.y))
+
+
+GRAZE_M = 0.05
+"""The edge of a box may be grazed by so much, so that a planner that keeps to the edge is not refused."""
+
+
+def crosses(box: Box, start: tuple[float, float], end: tuple[float, float], rim_m: float = GRAZE_M) -> bool:
+    """Tell whether a straight leg meets the `core` of a box, its edge included (Liang-Barsky clipping; exact)."""
+    within = core(box, rim_m)
     low, high = 0.0, 1.0
-    for begin, stop, near, far in (
-        (start[0], end[0], box.x[0] - margin, box.x[1] + margin),
-        (start[1], end[1], box.y[0] - margin, box.y[1] + margin),
-    ):
-        if near >= far:
-            return False
+    for begin, stop, (near, far) in ((start[0], end[0], within.x), (start[1], end[1], within.y)):
         length = stop - begin
         if abs(length) < 1e-9:
-            if not near < begin < far:
+            if not near <= begin <= far:
                 return False
             continue
         one, other = (near - begin) / length, (far - begin) / length
         low, high = max(low, min(one, other)), min(high, max(one, other))
-        if low >= high:
+        if low > high:
             return False
     return True
+
+
+def rings(box: Box, centre: tuple[float, float], radius_m: float, rim_m: float = GRAZE_M) -> bool:
+    """Tell whether a circle passes through the `core` of a box: its nearest point is nearer, its farthest farther."""
+    within = core(box, rim_m)
+    gaps = [(low - at, at - high) for at, (low, high) in zip(centre, (within.x, within.y), strict=True)]
+    nearest = math.hypot(*(max(*gap, 0.0) for gap in gaps))
+    farthest = math.hypot(*(max(abs(gap[0]), abs(gap[1])) for gap in gaps))
+    return nearest <= radius_m <= farthest
 
 
 def blocked_leg(
@@ -86,13 +105,15 @@ def blocked_leg(
 ) -> tuple[int, Box] | None:
     """Return index and box of the first leg through a box, None when the way is free.
 
-    Boxes that hold the start are left out: a robot that stands in one must be able to drive out of it.
+    A box that holds the start is left out until the way has left it: a robot that stands in one must be able to
+    drive out of it, and may not come back.
     """
-    closed = [box for box in boxes if not inside(box, *start)]
+    around = {index for index, box in enumerate(boxes) if inside(box, *start)}
     here = start
-    for index, point in enumerate(points):
-        for box in closed:
-            if crosses(box, here, point):
-                return index, box
+    for leg, point in enumerate(points):
+        for index, box in enumerate(boxes):
+            if index not in around and crosses(box, here, point):
+                return leg, box
+        around = {index for index in around if inside(boxes[index], *point)}
         here = point
     return None

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from appliance.errors import SwiftbotError, from_code
 from appliance.model import Box, Pose, RobotCommand, RobotInfo, Site
-from appliance.model.geo import blocked_leg, inside
+from appliance.model.geo import GRAZE_M, blocked_leg, core, inside
 from appliance.robots.policy import check_mission, check_orbit, check_points, check_speed
 from appliance.robots.verbs import (
     GotoArgs,
@@ -40,9 +40,7 @@ STALE_M = 0.5
 """A robot's place in the roster is some tenths of a second old: an area that it stands in or at by that place loses so
 much of its rim for the leg that begins there, which the robot itself, knowing better, looks at again."""
 _GROUND_M = 0.5
-_GRAZE_M = 0.05
-"""The edge of an area may be grazed (`geo.crosses`)."""
-_CORE_M = 4 * _GRAZE_M
+_CORE_M = 4 * GRAZE_M
 """What is left of the narrowest wall when it loses its rim: enough to be in the way."""
 
 
@@ -259,8 +257,8 @@ def _check_site(site: Site, info: RobotInfo | None, args: GotoArgs | MissionArgs
     here = None if info is None else info.pose
     match args:
         case OrbitArgs():
-            # Begun on the circle: its middle may be in an area, and the way to it is the robot's.
-            check_orbit(site, Pose(x=args.x + args.radius_m, y=args.y), args, flies=flies)
+            # The circle alone: its middle may be in an area, and the way to it is the robot's.
+            check_orbit(site, None, args, flies=flies)
             return
         case MissionArgs():
             check_mission(site, None, args, flies=flies)
@@ -273,7 +271,7 @@ def _check_site(site: Site, info: RobotInfo | None, args: GotoArgs | MissionArgs
     for box in closed:
         # Whatever stands in one must be able to leave it, by a point in it too.
         out = here is not None and inside(box, here.x, here.y, STALE_M)
-        if not out and inside(box, first.x, first.y, -_GRAZE_M):
+        if not out and inside(core(box, GRAZE_M), first.x, first.y):
             raise RobotFailure("refused", f"waypoint 1 is in {box.name}", remedy="choose a point outside of it")
     if len(way) > 1:
         check_points(site, Pose(x=first.x, y=first.y), way[1:], flies=flies, verb=_verb(args), behind=1)

@@ -8,8 +8,8 @@ anything moves. Pure.
 import math
 from collections.abc import Sequence
 
-from appliance.model import Pose, Site
-from appliance.model.geo import MAX_EXTENT_M, blocked_leg, inside
+from appliance.model import Box, Pose, Site
+from appliance.model.geo import MAX_EXTENT_M, blocked_leg, core, crosses, inside, rings
 from appliance.robots.verbs import (
     MAX_WAYPOINTS,
     GotoArgs,
@@ -21,8 +21,8 @@ from appliance.robots.verbs import (
     in_range,
 )
 
-_ROUND = 16
-"""Points of a circle that are looked at; 2 % inside it, which the margin makes up for."""
+_SOFT_M = 1.0
+"""How far a robot on its way may be in a forbidden area: what GPS errs and braking takes."""
 
 
 def check_way(site: Site, start: Pose, goto: GotoArgs, *, flies: bool) -> tuple[Waypoint, ...]:
@@ -46,25 +46,32 @@ def check_mission(site: Site, start: Pose | None, mission: MissionArgs, *, flies
     return points
 
 
-def check_orbit(site: Site, start: Pose, orbit: OrbitArgs, *, flies: bool) -> None:
-    """Raise RobotFailure unless the circle and the way to it are allowed."""
+def check_orbit(site: Site, start: Pose | None, orbit: OrbitArgs, *, flies: bool) -> None:
+    """Raise RobotFailure unless the circle, and the way to it, are allowed.
+
+    `start` None: it is not known where the robot goes from, so the circle alone is looked at.
+    """
     radius = abs(orbit.radius_m)
     if not (math.isfinite(radius) and 1.0 <= radius <= 500.0):
         raise RobotFailure("payload", f"orbit: a radius of {orbit.radius_m:g} m, 1 to 500 are possible")
     if not (math.isfinite(orbit.laps) and 0.0 < orbit.laps <= 100.0):
         raise RobotFailure("payload", f"orbit: {orbit.laps:g} laps, up to 100 are possible")
-    reach = radius / math.cos(math.pi / _ROUND)
-    first = math.atan2(start.y - orbit.y, start.x - orbit.x)
-    ring = [
-        Waypoint(
-            orbit.x + reach * math.cos(first + math.tau * step / _ROUND),
-            orbit.y + reach * math.sin(first + math.tau * step / _ROUND),
-            orbit.z,
-        )
-        for step in range(_ROUND + 1)
-    ]
-    check_points(site, start, ring, flies=flies, verb="orbit")
+    # Fence and altitude hold for the whole circle if they hold for the four points that are farthest out.
+    ends = [(radius, 0.0), (0.0, radius), (-radius, 0.0), (0.0, -radius)]
+    farthest = [Waypoint(orbit.x + x, orbit.y + y, orbit.z) for x, y in ends]
+    check_points(site, None, farthest, flies=flies, verb="orbit")
+    for box in _closed(site, flies=flies):
+        if rings(box, (orbit.x, orbit.y), radius):
+            raise RobotFailure("refused", f"the circle goes through {box.name}", remedy="choose another radius")
+    if start is not None:
+        angle = math.atan2(start.y - orbit.y, start.x - orbit.x)
+        first = Waypoint(orbit.x + radius * math.cos(angle), orbit.y + radius * math.sin(angle), orbit.z)
+        check_points(site, start, (first,), flies=flies, verb="orbit")
     check_speed(site, orbit.speed_mps, verb="orbit")
+
+
+def _closed(site: Site, *, flies: bool) -> tuple[Box, ...]:
+    return site.forbidden if flies else (*site.forbidden, *site.obstacles)
 
 
 def check_points(
@@ -103,7 +110,7 @@ def check_points(
             )
     if start is None:
         return
-    closed = site.forbidden if flies else (*site.forbidden, *site.obstacles)
+    closed = _closed(site, flies=flies)
     blocked = blocked_leg(closed, (start.x, start.y), [(point.x, point.y) for point in points])
     if blocked is not None:
         index, box = blocked
@@ -154,16 +161,24 @@ def check_velocity(site: Site, start: Pose, move: VelocityArgs, *, flies: bool) 
     return east, north, move.up_mps
 
 
-def breach(site: Site, pose: Pose, *, flies: bool, margin_m: float = 3.0) -> str:
+def breach(site: Site, pose: Pose, *, flies: bool, before: Pose | None = None, margin_m: float = 3.0) -> str:
     """Return in words how a robot that moves has left what the site allows, empty when it has not.
 
-    The margin is what GPS and braking need: a robot that grazes the edge is not stopped for it.
+    Args:
+        site: whose fence, areas and limits hold.
+        pose: where it is.
+        flies: whether it has an altitude.
+        before: where it was when it was looked at last: between two looks it may pass right through a narrow area.
+        margin_m: what GPS and braking need: a robot that grazes the edge is not stopped for it.
     """
     if site.fence is not None and not inside(site.fence, pose.x, pose.y, margin_m):
         return f"it is outside {site.fence.name}, at ({pose.x:.0f}, {pose.y:.0f})"
     if flies and pose.z > site.altitude_limit_m + margin_m:
         return f"it is {pose.z:.0f} m up, the site allows {site.altitude_limit_m:g} m"
+    rim = min(margin_m, _SOFT_M)
     for box in site.forbidden:
-        if inside(box, pose.x, pose.y, -min(margin_m, 1.0)):
+        if inside(core(box, rim), pose.x, pose.y):
             return f"it is in {box.name}"
+        if before is not None and crosses(box, (before.x, before.y), (pose.x, pose.y), rim):
+            return f"it went through {box.name}"
     return ""

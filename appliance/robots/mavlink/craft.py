@@ -133,9 +133,7 @@ class Craft:
             # acknowledgement that comes late may be that one's.
             sent = loop.time()
             flag = dialect.CUSTOM_MODE_FLAG
-            await command(
-                vehicle, dialect.SET_MODE, flag, wanted, patience=self.patience, check=check, behind=behind
-            )
+            await command(vehicle, dialect.SET_MODE, flag, wanted, patience=self.patience, check=check, behind=behind)
             behind = None
             if await self.confirm(lambda since=sent: changed(since)):
                 return
@@ -259,13 +257,15 @@ class Craft:
         vehicle = self.vehicle
         loop = asyncio.get_running_loop()
         best, since = left(), loop.time()
+        here = vehicle.pose
         outside = self._breach()
         while not there():
             await asyncio.sleep(POLL_S)
             if there():
                 return
             now, distance = loop.time(), left()
-            await self._check_way(verb, mode, outside=outside, safe=safe)
+            before, here = here, vehicle.pose
+            await self._check_way(verb, mode, before, outside=outside, safe=safe)
             if distance < best - _NEARER_M or steady():
                 best, since = min(best, distance), now
             elif now - since > self.config.stall_s:
@@ -278,7 +278,7 @@ class Craft:
                     retryable=True,
                 )
 
-    async def _check_way(self, verb: str, mode: str, *, outside: str, safe: bool) -> None:
+    async def _check_way(self, verb: str, mode: str, before: Pose | None, *, outside: str, safe: bool) -> None:
         vehicle = self.vehicle
         seized = vehicle.control.seized
         if seized is not None and not (safe and seized.by == "failsafe"):
@@ -292,7 +292,7 @@ class Craft:
             )
         if not vehicle.armed and verb not in ("land", "return_home"):
             raise RobotFailure("robot", f"{vehicle.name} disarmed during {verb}: {vehicle.text}".rstrip(": "))
-        if not outside and not safe and (left := self._breach()):
+        if not outside and not safe and (left := self._breach(before)):
             await self.halt()
             raise RobotFailure(
                 "refused",
@@ -300,9 +300,9 @@ class Craft:
                 remedy="see to the vehicle, and bring it back inside",
             )
 
-    def _breach(self) -> str:
+    def _breach(self, before: Pose | None = None) -> str:
         pose = self.vehicle.pose
-        return "" if pose is None else breach(self.site, pose, flies=self.vehicle.flies)
+        return "" if pose is None else breach(self.site, pose, flies=self.vehicle.flies, before=before)
 
     def target(self, latitude_deg: float, longitude_deg: float, relative_m: float) -> None:
         """Send a position to go to in the guided mode; these are not acknowledged."""

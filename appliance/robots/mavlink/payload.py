@@ -136,7 +136,10 @@ class Payload:
     # --- gimbal ------------------------------------------------------------------------------------------------
 
     async def gimbal(self, args: GimbalArgs) -> Done:
-        """Turn the gimbal to angles, or keep it on a point of the site."""
+        """Turn the gimbal to angles, or keep it on a point of the site.
+
+        A gimbal that cannot turn sideways has its vehicle turn, so control is looked at before each sending.
+        """
         craft = self._craft
         point = args.x is not None and args.y is not None
         if point == (args.pitch_deg is not None or args.yaw_deg is not None):
@@ -154,6 +157,7 @@ class Payload:
                 patience=craft.patience,
                 component=manager,
                 frame=dialect.FRAME_GLOBAL,
+                check=craft.check_control,
             )
             return Done({"at": {"x": args.x, "y": args.y, "z": args.z}} | craft.where())
         pitch, yaw = args.pitch_deg or 0.0, args.yaw_deg or 0.0
@@ -173,6 +177,7 @@ class Payload:
                 0.0,
                 patience=craft.patience,
                 component=manager,
+                check=craft.check_control,
             )
             confirmed = await _turned(answers, pitch)
         return Done({"pitch_deg": pitch, "yaw_deg": yaw, "confirmed": confirmed} | craft.where())
@@ -197,7 +202,14 @@ class Payload:
                     "robot", f"{vehicle.name} has no gimbal that answers", remedy="look whether it is powered"
                 )
         control = (_MYSELF, _MYSELF, _UNCHANGED, _UNCHANGED)
-        await ask(vehicle, _CONFIGURE, *control, patience=craft.patience, component=self._manager)
+        await ask(
+            vehicle,
+            _CONFIGURE,
+            *control,
+            patience=craft.patience,
+            component=self._manager,
+            check=craft.check_control,
+        )
         return self._manager
 
     # --- gripper, servo, voice ---------------------------------------------------------------------------------

@@ -89,7 +89,9 @@ async def command(
         RobotFailure: `robot` when the vehicle declines (with its own words where it gave some), or, retryable,
             when no acknowledgement came after all tries; what `check` raises.
     """
-    outcome = await ask(vehicle, number, *parameters, patience=patience, component=component, check=check, behind=behind)
+    outcome = await ask(
+        vehicle, number, *parameters, patience=patience, component=component, check=check, behind=behind
+    )
     return accepted(vehicle, number, outcome)
 
 
@@ -134,6 +136,7 @@ async def command_at(
     patience: Patience,
     component: int | None = None,
     frame: int = dialect.FRAME_RELATIVE,
+    check: Callable[[], None] = _always,
 ) -> Outcome:
     """Send COMMAND_INT, which carries a position without the rounding of COMMAND_LONG's floats.
 
@@ -145,6 +148,7 @@ async def command_at(
         patience: how long and how often.
         component: another than the autopilot.
         frame: MAV_FRAME.
+        check: called right before each sending, as of `command`.
 
     Raises:
         RobotFailure: as `command`.
@@ -171,7 +175,7 @@ async def command_at(
             z=altitude,
         )
 
-    return accepted(vehicle, number, await _exchange(vehicle, build, number, target, patience))
+    return accepted(vehicle, number, await _exchange(vehicle, build, number, target, patience, check))
 
 
 async def _exchange(

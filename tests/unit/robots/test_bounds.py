@@ -72,6 +72,7 @@ SLOW = RobotLimits(speed_mps=1.5, range_m=50.0)
             "the leg to waypoint 2 goes through the pit",
         ),
         (order("orbit", x=24, y=10, radius_m=3), "goes through the pit"),
+        (order("orbit", x=15, y=10, radius_m=5), "the circle goes through the pit"),
         (order("orbit", x=3, y=10, radius_m=5), "outside the yard"),
         (goto((10, 10), speed_mps=-1.0), "gets nowhere"),
         (goto((math.nan, 10)), "longer than 50 m"),

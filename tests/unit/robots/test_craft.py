@@ -16,13 +16,14 @@ from appliance.robots.mavlink.craft import Craft
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.missions import Missions
 from appliance.robots.mavlink.modes import COPTER
+from appliance.robots.mavlink.payload import Payload
 from appliance.robots.mavlink.protocol import command
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import RobotsConfig
 from appliance.robots.sim import orders
 from appliance.robots.sim.copter import SimCopter
 from appliance.robots.sim.flight import Point
-from appliance.robots.verbs import MissionArgs, MissionStep, RobotFailure, TakeoffArgs
+from appliance.robots.verbs import GimbalArgs, MissionArgs, MissionStep, RobotFailure, TakeoffArgs
 
 pytestmark = pytest.mark.anyio
 _EVERY_S = 0.02
@@ -71,7 +72,8 @@ class Flown:
 
     def commands(self, number: int) -> list[Message]:
         """Return the commands of that number that were sent to it."""
-        return [each for each in self.sent if each.get_type() == "COMMAND_LONG" and each.command == number]
+        kinds = ("COMMAND_LONG", "COMMAND_INT")
+        return [each for each in self.sent if each.get_type() in kinds and each.command == number]
 
     async def until_still(self) -> None:
         """Give it the time in which it would have gone on."""
@@ -229,6 +231,56 @@ async def test_a_pilot_who_takes_it_as_it_is_armed_keeps_it(
     assert not flown.commands(dialect.MISSION_START)
     assert len(flown.commands(dialect.SET_MODE)) == 1  # GUIDED, before it was armed
     assert flown.vehicle.mode == "LOITER"
+
+
+@pytest.mark.parametrize(
+    ("args", "number"),
+    [(GimbalArgs(x=5.0, y=5.0), dialect.LOOK_AT), (GimbalArgs(pitch_deg=-30.0), dialect.GIMBAL_ANGLES)],
+)
+async def test_a_pilot_who_takes_it_keeps_its_gimbal(
+    flown: Flown, monkeypatch: pytest.MonkeyPatch, args: GimbalArgs, number: int
+) -> None:
+    """What turns a gimbal may turn its vehicle: once a pilot has taken over it is not sent again, nor anew."""
+    real = orders.answer
+
+    def answer(vehicle: Any, message: Message, sender: Any) -> list[Message]:
+        if message.command == number:
+            vehicle.set_mode(COPTER.numbers["LOITER"])
+            flown.say([vehicle.heartbeat()])
+            return []
+        if message.command in (dialect.REQUEST_MESSAGE, dialect.constant("MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE")):
+            return [_accepted(message)]
+        return real(vehicle, message, sender)
+
+    monkeypatch.setattr(orders, "answer", answer)
+    payload = Payload(flown.craft)
+    await flown.arm()
+    for times in (1, 1):
+        with pytest.raises(RobotFailure, match="LOITER") as caught:
+            await payload.gimbal(args)
+        assert caught.value.failure.code == "taken"
+        assert len(flown.commands(number)) == times
+
+
+def _accepted(message: Message) -> Message:
+    target = {"target_system": 242, "target_component": 191}
+    return dialect.make(
+        "COMMAND_ACK", command=message.command, result=dialect.ACCEPTED, progress=0, result_param2=0, **target
+    )
+
+
+async def test_what_goes_through_a_narrow_area_between_two_looks_is_stopped(flown: Flown) -> None:
+    """It was on one side of a wall and is on the other, and no look found it inside."""
+    flown.craft.site = Site(forbidden=(Box(name="the line", x=(-50.0, 50.0), y=(10.0, 10.05)),))
+    await flown.arm()
+    flown.sim.flight.position = flown.sim.flight.target = Point(0.0, 5.0, 5.0)
+    assert await flown.craft.confirm(lambda: abs(flown.craft.position().y - 5.0) < 1.0)
+    going = asyncio.create_task(flown.craft.travel("goto", "GUIDED", lambda: False, lambda: 100.0))
+    await asyncio.sleep(_EVERY_S)
+    flown.sim.flight.position = flown.sim.flight.target = Point(0.0, 15.0, 5.0)
+    with pytest.raises(RobotFailure, match="stopped during goto: it went through the line") as caught:
+        await going
+    assert caught.value.failure.code == "refused"
 
 
 async def test_a_vehicle_that_is_only_watched_is_not_said_to_be_halted(flown: Flown) -> None:

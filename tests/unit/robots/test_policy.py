@@ -78,6 +78,49 @@ def test_the_rest_of_a_mission_is_looked_at_from_where_the_robot_is() -> None:
         check_mission(SITE, None, MissionArgs(steps=(MissionStep(50, 10),)), flies=True)
 
 
+def test_a_circle_meets_what_lies_between_its_points() -> None:
+    """A post on the circle counts wherever it stands, one beside it nowhere, and one that the robot stands in too."""
+    for degrees in range(0, 360, 5):
+        x, y = 50 * math.cos(math.radians(degrees)), 50 * math.sin(math.radians(degrees))
+        post = Box(name="the post", x=(x - 0.02, x + 0.02), y=(y - 0.02, y + 0.02))
+        site = Site(forbidden=(post,), altitude_limit_m=30.0)
+        for start in (Pose(x=0.0, y=0.0), Pose(x=x, y=y), None):
+            with pytest.raises(RobotFailure, match="the circle goes through the post"):
+                check_orbit(site, start, OrbitArgs(x=0, y=0, radius_m=50), flies=True)
+            check_orbit(site, start, OrbitArgs(x=0, y=0, radius_m=49.9), flies=True)
+
+
+def test_a_thin_wall_stops_what_flies_and_what_drives() -> None:
+    """A forbidden line of a centimetre stops both, an obstacle what drives; a way round is allowed."""
+    line = Box(name="the line", x=(10.0, 10.01), y=(0.0, 20.0))
+    through = GotoArgs(waypoints=(Waypoint(20, 5),))
+    round_it = GotoArgs(waypoints=(Waypoint(5, 25), Waypoint(20, 25), Waypoint(20, 5)))
+    for flies in (True, False):
+        site = Site(forbidden=(line,)) if flies else Site(obstacles=(line,))
+        with pytest.raises(RobotFailure, match="goes through the line"):
+            check_way(site, HERE, through, flies=flies)
+        assert check_way(site, HERE, round_it, flies=flies)
+    assert check_way(Site(obstacles=(line,)), HERE, through, flies=True)
+
+
+def test_what_leaves_a_forbidden_area_may_not_come_back() -> None:
+    """It may leave the one that it stands in, and no leg after that goes through it again."""
+    inside = Pose(x=20.0, y=10.0)
+    assert check_way(SITE, inside, GotoArgs(waypoints=(Waypoint(21, 11), Waypoint(30, 10))), flies=True)
+    with pytest.raises(RobotFailure, match="the leg to waypoint 2 goes through the pit"):
+        check_way(SITE, inside, GotoArgs(waypoints=(Waypoint(30, 10), Waypoint(10, 10))), flies=True)
+
+
+def test_a_narrow_area_is_left_by_nobody_unseen() -> None:
+    """Where a robot was and where it is count, however thin what lies between them is."""
+    site = Site(forbidden=(Box(name="the line", x=(10.0, 10.02), y=(0.0, 20.0)),))
+    here, there = Pose(x=9.0, y=5.0), Pose(x=11.0, y=5.0)
+    assert breach(site, there, flies=True) == ""
+    assert breach(site, there, flies=True, before=here) == "it went through the line"
+    assert breach(site, Pose(x=10.01, y=5.0), flies=True) == "it is in the line"
+    assert breach(site, Pose(x=9.5, y=9.0), flies=True, before=here) == ""
+
+
 def test_what_has_left_the_site() -> None:
     """Beyond the fence, above the ceiling or in a forbidden area; grazing the edge is not left."""
     assert breach(SITE, Pose(x=20, y=20, z=10), flies=True) == ""

@@ -123,6 +123,35 @@ async def test_a_position_travels_whole() -> None:
     assert (fake.sent[0].x, fake.sent[0].y, fake.sent[0].z) == (473977421, -85455942, 12.5)
 
 
+@pytest.mark.parametrize("positioned", [True, False])
+async def test_nothing_is_sent_again_once_it_may_not_be(positioned: bool) -> None:
+    """The first is lost, then a pilot takes over: no repetition, with or without a position, and no new order."""
+    taken = False
+
+    def check() -> None:
+        if taken:
+            raise RobotFailure("taken", "drone_1 is not commanded: a pilot has it")
+
+    def lose(_: Message) -> list[Message]:
+        nonlocal taken
+        taken = True
+        return []
+
+    fake = Fake(lose)
+
+    async def order() -> None:
+        if positioned:
+            await command_at(fake.vehicle, 195, at=(47.0, 8.0, 12.5), patience=PATIENCE, check=check)
+        else:
+            await command(fake.vehicle, 195, patience=PATIENCE, check=check)
+
+    for sent in (1, 1):
+        with pytest.raises(RobotFailure, match="a pilot has it") as caught:
+            await order()
+        assert caught.value.failure.code == "taken"
+        assert len(fake.sent) == sent
+
+
 async def test_a_mission_is_read_back_over_losses() -> None:
     """Each request is lost once; items come in order, once each, and the end is acknowledged."""
     seen: dict[str, int] = {}
