@@ -5,9 +5,10 @@ import contextlib
 import os
 import pty
 import socket
+import struct
 import tty
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any, cast
 
 import msgspec
@@ -21,13 +22,15 @@ from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Stream, make
 from appliance.robots.mavlink.kinds import KINDS, checksum, decode
 from appliance.robots.mavlink.signing import Signer
 from appliance.robots.mavlink.station import Station
-from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE
+from appliance.robots.mavlink.tunnel import MAX_GOING, MAX_PAYLOAD, PART, PAYLOAD_TYPE
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from tests.unit.robots.conftest import FakeSession, FakeStore
 
 pytestmark = pytest.mark.anyio
 
 BEAT = {"type": 2, "autopilot": 3, "base_mode": 0, "custom_mode": 4, "system_status": 4, "mavlink_version": 3}
+STATION = BEAT | {"autopilot": 8, "type": 6}
+"""A ground station's heartbeat: from then on what it asks is listened to."""
 KEY = bytes(range(32))
 
 
@@ -150,82 +153,246 @@ def test_streams_of_anything(parts: list[bytes], size: int, signed: bool) -> Non
     assert used + stream.pending == len(whole)
 
 
-@settings(max_examples=15)
-@given(st.lists(raws, min_size=1, max_size=60))
-async def test_a_gateway_that_hears_anything(datagrams: list[bytes]) -> None:
-    """Random bytes, good frames with random payloads, tunnels that lie: a vehicle that speaks meanwhile is heard."""
-    port = _port()
-    async with station(port) as (made, refused), sender(port) as stranger, sender(port) as vehicle:
-        codec = Codec(77, 1)
-        for raw in datagrams:
-            stranger(raw)
-        # A stranger may have taken the vehicle's name before: then both are told apart, and that is counted.
-        await until(
-            lambda: "drone_77" in made.attached and any(each.senders for each in made.link_list().links),
-            lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))),
-        )
-        assert all(count >= 0 for count in refused.values())
+LINKS = ("udp listen", "udp connect", "tcp listen", "tcp connect", "serial")
 
 
-@settings(max_examples=10)
-@given(st.lists(raws, min_size=1, max_size=60))
-async def test_a_stream_that_brings_anything(datagrams: list[bytes]) -> None:
-    """The same over TCP: what is no frame is skipped, what is one is found behind it, and others are served."""
-    port, stream = _port(), _port(socket.SOCK_STREAM)
-    async with (
-        station(port, MavlinkLink(listen=f"tcp://127.0.0.1:{stream}")) as (made, refused),
-        sender(port) as vehicle,
-    ):
-        _, writer = await asyncio.open_connection("127.0.0.1", stream)
-        for raw in datagrams:
-            writer.write(raw)
-        await writer.drain()
-        await _served(made, vehicle)
-        # Behind all that the stream is understood again: at the latest when the longest frame that it may have begun
-        # is at its end.
-        codec = Codec(78, 1)
-        await until(
-            lambda: any(each.system == 78 for link in made.link_list().links for each in link.senders),
-            lambda: writer.write(codec.pack(make("HEARTBEAT", **BEAT)) + bytes(280)),
-        )
-        writer.close()
-        assert all(count >= 0 for count in refused.values())
+class Outside:
+    """Who is at the other end of a gateway's link of some kind, and brings what the test wants."""
 
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self._port = 0
+        self._datagrams: Callable[[bytes], None] | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._master = -1
+        self._left = bytearray()
 
-@settings(max_examples=10)
-@given(st.lists(raws, min_size=1, max_size=60))
-async def test_a_serial_port_that_brings_anything(datagrams: list[bytes]) -> None:
-    """The same over a serial port (a pseudo-terminal): a radio's noise keeps nobody else from being served."""
-    port = _port()
-    master, slave = pty.openpty()
-    tty.setraw(master)
-    os.set_blocking(master, False)
-    device = MavlinkLink(connect=f"serial:{os.ttyname(slave)}:57600")
-    try:
-        async with station(port, device) as (made, refused), sender(port) as vehicle:
-            await until(lambda: not any(each.problem for each in made.link_list().links))
-            left = bytearray(b"".join(datagrams))
-            codec = Codec(78, 1)
+    async def prepare(self, closing: AsyncExitStack) -> MavlinkLink:
+        """Return the link that a gateway is to open; what it connects to is there already."""
+        if self.kind == "serial":
+            self._master, slave = pty.openpty()
+            closing.callback(os.close, self._master)
+            closing.callback(os.close, slave)
+            tty.setraw(self._master)
+            os.set_blocking(self._master, False)
+            return MavlinkLink(connect=f"serial:{os.ttyname(slave)}:57600")
+        scheme, _, way = self.kind.partition(" ")
+        if way == "listen":
+            self._port = _port(socket.SOCK_DGRAM if scheme == "udp" else socket.SOCK_STREAM)
+            return MavlinkLink(listen=f"{scheme}://127.0.0.1:{self._port}")
+        if scheme == "udp":
+            outside = self
 
-            def write() -> None:
-                with contextlib.suppress(BlockingIOError):
-                    sent = os.write(master, left or codec.pack(make("HEARTBEAT", **BEAT)) + bytes(280))
-                    del left[:sent]
+            class Waiting(asyncio.DatagramProtocol):
+                def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                    self.transport = cast("asyncio.DatagramTransport", transport)
 
-            await _served(made, vehicle)
-            await until(
-                lambda: any(each.system == 78 for link in made.link_list().links for each in link.senders), write
+                def datagram_received(self, _: bytes, address: Any) -> None:
+                    outside._datagrams = lambda raw: self.transport.sendto(raw, address)
+
+            transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+                Waiting, local_addr=("127.0.0.1", 0)
             )
-            assert all(count >= 0 for count in refused.values())
-    finally:
-        os.close(master)
-        os.close(slave)
+            closing.callback(transport.close)
+            return MavlinkLink(connect=f"udp://127.0.0.1:{transport.get_extra_info('sockname')[1]}")
+
+        def accept(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            self._writer = writer
+            closing.callback(writer.close)
+
+        server = await asyncio.start_server(accept, "127.0.0.1", 0)
+        closing.callback(server.close)
+        return MavlinkLink(connect=f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+
+    async def meet(self, made: Station, closing: AsyncExitStack) -> None:
+        """Come to the gateway, or wait until it has come."""
+        if self.kind == "udp listen":
+            self._datagrams = await closing.enter_async_context(sender(self._port))
+        elif self.kind == "tcp listen":
+            _, self._writer = await asyncio.open_connection("127.0.0.1", self._port)
+            closing.callback(self._writer.close)
+        elif self.kind == "serial":
+            await until(lambda: not any(each.problem for each in made.link_list().links))
+        else:
+            await until(lambda: self._datagrams or self._writer)
+
+    def write(self, *raws: bytes) -> None:
+        """Send some frames, or go on with what a serial port has not taken yet."""
+        for raw in raws:
+            if self._datagrams is not None:
+                self._datagrams(raw)
+            elif self._writer is not None:
+                self._writer.write(raw)
+            elif len(self._left) < 2**16:
+                self._left += raw
+        if self._left:
+            with contextlib.suppress(BlockingIOError):
+                del self._left[: os.write(self._master, self._left)]
 
 
-async def _served(made: Station, vehicle: Callable[[bytes], None]) -> None:
-    """Wait until a vehicle on another link is a robot."""
+@asynccontextmanager
+async def beside(
+    kind: str, signing: str = "", **changes: Any
+) -> AsyncIterator[tuple[Station, dict[str, int], Outside, Callable[[bytes], None]]]:
+    """Open a station with a link of that kind, whose other end the test has, and another link with a vehicle."""
+    port, outside = _port(), Outside(kind)
+    async with AsyncExitStack() as closing:
+        link = msgspec.structs.replace(await outside.prepare(closing), signing=signing)
+        made, refused = await closing.enter_async_context(station(port, link, **changes))
+        await outside.meet(made, closing)
+        vehicle = await closing.enter_async_context(sender(port))
+        yield made, refused, outside, vehicle
+
+
+@pytest.mark.parametrize("kind", LINKS)
+@settings(max_examples=8)
+@given(brought=st.lists(raws, min_size=1, max_size=60))
+async def test_an_end_that_brings_anything(kind: str, brought: list[bytes]) -> None:
+    """Random bytes, good frames with random payloads, tunnels that lie: the others are served, and it is understood."""
+    async with beside(kind) as (made, refused, outside, vehicle):
+        outside.write(Codec(255, 190).pack(make("HEARTBEAT", **STATION)), *brought)
+        # A stranger may have taken the vehicle's name before: then both are told apart, and that is counted.
+        await _served(made, vehicle, outside)
+        # Behind all that a stream is understood again: at the latest when the longest frame that it may have begun
+        # is at its end.
+        await _understood(made, outside)
+        assert all(count >= 0 for count in refused.values())
+
+
+@pytest.mark.parametrize("kind", LINKS)
+async def test_what_is_none_is_counted(kind: str) -> None:
+    """Wrong checksums, cut frames, parts of messages that are cut or lie, absurd counts: counted, kept nowhere."""
+    async with beside(kind) as (made, refused, outside, vehicle):
+        await _served(made, vehicle, outside)
+        codec = Codec(255, 190)
+
+        def damaged() -> bytes:
+            raw = codec.pack(make("HEARTBEAT", **STATION))
+            return raw[:-1] + bytes((raw[-1] ^ 0xFF,))
+
+        outside.write(codec.pack(make("HEARTBEAT", **STATION)))
+        await until(lambda: refused.get("checksum"), lambda: outside.write(damaged()))
+        await until(
+            lambda: refused.get("truncated") or outside._datagrams is None, lambda: outside.write(damaged()[:9])
+        )
+        await _understood(made, outside)
+        part = _part(index=0, count=3, data=bytes(112))
+        for payload in (
+            part[:7],  # a header that is cut
+            part[:-1],  # a part that is cut, and not the last
+            b"XX" + part[2:],  # of another protocol
+            _part(index=3, count=3, data=b"x"),  # the fourth of three
+            _part(index=0, count=0, data=b""),  # the first of none
+        ):
+            before = refused.get("tunnel_malformed", 0)
+            await until(
+                lambda before=before: refused.get("tunnel_malformed", 0) > before,
+                lambda payload=payload: outside.write(_tunnel(codec, payload)),
+            )
+        before = refused.get("mission_refused", 0)
+        target = {"target_system": 77, "target_component": 191, "mission_type": 0}
+        await until(
+            lambda: refused.get("mission_refused", 0) > before,
+            lambda: outside.write(codec.pack(make("MISSION_COUNT", count=65_535, **target))),
+        )
+        await until(lambda: not made._switch._missions._uploads)
+        # More parts than any message may have: refused, and nothing of it is kept.
+        for _ in range(200):
+            outside.write(_tunnel(codec, _part(index=7, count=65_535, data=bytes(112))))
+        await _understood(made, outside, system=79)
+        channel = made._switch._letters._senders[255, 190].channel
+        assert not channel._coming
+        assert len(channel._refusals) <= MAX_GOING
+        await _served(made, vehicle, outside)
+
+
+@pytest.mark.parametrize("kind", LINKS)
+async def test_signed_frames_that_are_played_again(kind: str, tmp_path: Any) -> None:
+    """On any link: each is refused as what it is, so are unsigned and wrongly signed ones, and the vehicle stays."""
+    key = tmp_path / "key"
+    key.write_text("hex:" + KEY.hex())
+    key.chmod(0o600)
+    async with beside(kind, signing=str(key), repeat_s=0.0) as (made, refused, outside, _):
+        codec = Codec(1, 1, signer=Signer(KEY, link_id=1))
+        recorded: list[bytes] = []
+
+        def beat() -> None:
+            recorded.append(codec.pack(make("HEARTBEAT", **BEAT)))
+            outside.write(recorded[-1])
+
+        await until(lambda: made.attached == ("drone_1",), beat)
+        assert "replayed" not in refused
+        outside.write(*recorded)
+        await until(lambda: refused.get("replayed", 0) == len(recorded), outside.write)
+        forger = Codec(2, 1, signer=Signer(KEY[::-1], link_id=1))
+        await until(lambda: refused.get("bad_signature"), lambda: outside.write(forger.pack(make("HEARTBEAT", **BEAT))))
+        plain = Codec(2, 1)
+        await until(lambda: refused.get("unsigned"), lambda: outside.write(plain.pack(make("HEARTBEAT", **BEAT))))
+        assert made.attached == ("drone_1",)
+
+
+@pytest.mark.parametrize("kind", LINKS)
+async def test_a_flood_on_one_link(kind: str) -> None:
+    """One that sends far more than it may is cut off or slowed, which is counted, and a vehicle elsewhere is served."""
+    async with beside(kind, sender_hz=100.0) as (made, refused, outside, vehicle):
+        loud, codec = Codec(255, 190), Codec(77, 1)
+
+        def both() -> None:
+            outside.write(*(loud.pack(make("HEARTBEAT", **STATION)) for _ in range(60)))
+            vehicle(codec.pack(make("HEARTBEAT", **BEAT)))
+
+        counted = "flood" if kind.startswith("udp") else "slowed"
+        await until(lambda: "drone_77" in made.attached and refused.get(counted, 0) > 0, both)
+
+
+@pytest.mark.parametrize("kind", LINKS)
+async def test_two_vehicles_with_one_system_id_on_two_links(kind: str) -> None:
+    """The first one is believed; what says the same on another link is counted, and its place is not taken."""
+    async with beside(kind) as (made, refused, outside, vehicle):
+        one, two = Codec(1, 1), Codec(1, 1)
+        await until(lambda: made.attached, lambda: vehicle(one.pack(make("HEARTBEAT", **BEAT))))
+        two._mav.seq = 100
+
+        def both() -> None:
+            vehicle(one.pack(make("HEARTBEAT", **BEAT)))
+            outside.write(two.pack(make("HEARTBEAT", **(BEAT | {"custom_mode": 9, "base_mode": 128}))))
+
+        await until(lambda: refused.get("name_conflict", 0) > 5, both)
+        assert made.attached == ("drone_1",)
+        assert {(each.mode, each.armed) for each in _told(made)} <= {("GUIDED", False)}
+
+
+def _part(*, index: int, count: int, data: bytes) -> bytes:
+    return struct.pack("<2sBBIHHI", b"SB", 1, PART, 4711, index, count, 0) + data
+
+
+def _tunnel(codec: Codec, payload: bytes) -> bytes:
+    return codec.pack(
+        make(
+            "TUNNEL", target_system=242, target_component=191, payload_type=PAYLOAD_TYPE,
+            payload_length=len(payload), payload=list(payload.ljust(MAX_PAYLOAD, b"\0")),
+        )
+    )  # fmt: skip
+
+
+async def _understood(made: Station, outside: Outside, system: int = 78) -> None:
+    """Wait until a frame is heard from this end."""
+    codec = Codec(system, 1)
+    await until(
+        lambda: any(each.system == system for link in made.link_list().links for each in link.senders),
+        lambda: outside.write(codec.pack(make("HEARTBEAT", **BEAT)) + bytes(280)),
+    )
+
+
+async def _served(made: Station, vehicle: Callable[[bytes], None], outside: Outside) -> None:
+    """Wait until a vehicle on another link is a robot, while this one brings what it has left."""
     codec = Codec(77, 1)
-    await until(lambda: "drone_77" in made.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
+
+    def act() -> None:
+        vehicle(codec.pack(make("HEARTBEAT", **BEAT)))
+        outside.write()
+
+    await until(lambda: "drone_77" in made.attached, act)
 
 
 @settings(max_examples=5)

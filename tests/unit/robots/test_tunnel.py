@@ -2,12 +2,13 @@
 
 import itertools
 import random
+import struct
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.robots.mavlink.tunnel import MAX_BYTES, MAX_GOING, MAX_PAYLOAD, Channel, NotDelivered
+from appliance.robots.mavlink.tunnel import MAX_BYTES, MAX_GOING, MAX_PAYLOAD, PART, Channel, NotDelivered
 
 
 class Radio:
@@ -116,6 +117,34 @@ def test_no_payload_does_harm(payloads: list[bytes]) -> None:
         radio.step()
     assert not radio.ends[0].going(number)
     assert b"still here" in radio.got[1]
+
+
+def test_parts_that_are_cut_anywhere_cost_nothing() -> None:
+    """Each part of a message, cut at every byte, comes before it comes whole: counted, and the message arrives."""
+    radio = Radio(loss=0.0, seed=5)
+    data = bytes(range(256)) * 2
+    number = radio.ends[0].send(data, 0.0)
+    *parts, last = radio.ends[0].due(0.0)
+    cuts = [part[:cut] for part in parts for cut in range(len(part))] + [last[:cut] for cut in range(16)]
+    for part in cuts:
+        assert radio.ends[1].take(part, 0.0) is None
+    assert radio.ends[1].malformed == len(cuts)
+    assert [radio.ends[1].take(part, 0.0) for part in (*parts, last)] == [*([None] * len(parts)), data]
+    while radio.ends[0].going(number):
+        radio.step()
+    assert not radio.ends[0].failed
+
+
+def test_a_count_that_no_message_has_is_refused_and_kept_nowhere() -> None:
+    """Sixty-five thousand parts announced, again and again: the sender is told, and memory stays."""
+    end = Channel(itertools.count().__next__)
+    for number in range(1000):
+        head = struct.pack("<2sBBIHHI", b"SB", 1, PART, number, number % 65_535, 65_535, 0)
+        assert end.take(head + bytes(112), 0.0) is None
+    assert not end._coming
+    told = end.due(1.0)
+    assert 0 < len(told) <= MAX_GOING
+    assert all(b"at most" in each for each in told)
 
 
 def test_a_changed_message_is_not_taken() -> None:
