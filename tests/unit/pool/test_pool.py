@@ -395,11 +395,10 @@ async def test_adoption(bench: Any) -> None:
 
 async def test_adoption_after_a_kill_in_mid_run(bench: Any, tmp_path: Path) -> None:
     """A run whose gateway is gone is ended by the runner, and its container is adopted."""
-    before = await bench.pool()
-    task = asyncio.create_task(bench.run(before, bench.request(1, do="sleep", pid=str(tmp_path / "pid"))))
-    await bench.until((tmp_path / "pid").exists, "the run")
-    await asyncio.sleep(0.05)
-    pid = int((tmp_path / "pid").read_text())
+    before, noted = await bench.pool(), tmp_path / "pid"
+    task = asyncio.create_task(bench.run(before, bench.request(1, do="sleep", pid=str(noted))))
+    await bench.until(lambda: noted.exists() and bool(noted.read_text()), "the run")
+    pid = int(noted.read_text())
     task.cancel()
     # What a killed process does: its sockets are closed, and it does nothing else.
     keeper = before._keeper

@@ -20,7 +20,7 @@ Zygote = Callable[[], Awaitable[Any]]
 async def _finish(connection: Any) -> list[dict[str, Any]]:
     """All frames of a run to the end of file."""
     frames = []
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         while (frame := await connection.receive()) is not None:
             frames.append(frame)
     return frames
@@ -45,21 +45,21 @@ def _gone(pid: int) -> bool:
 
 
 async def _wait_for(path: Path) -> str:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not path.exists() or not path.read_text():
             await asyncio.sleep(0.005)
     return path.read_text()
 
 
 async def _wait_gone(pid: int) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not _gone(pid):
             await asyncio.sleep(0.005)
 
 
 async def _wait_free(zygote: Zygote) -> None:
     control = await zygote()
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while True:
             await control.send({"op": "ping"})
             if not (await control.receive())["run"]:
@@ -274,7 +274,7 @@ async def test_stop_ends_the_run_and_the_runner(zygote: Zygote, tmp_path: Path) 
     assert (last["code"], last["retryable"]) == ("stopped", True)
     assert _gone(pid)
     process = zygote.process  # type: ignore[attr-defined]
-    assert await asyncio.wait_for(process.wait(), 10) == 0
+    assert await asyncio.wait_for(process.wait(), 60) == 0
 
 
 async def test_a_stopped_container_ends_its_run_for_another_try(zygote: Zygote, tmp_path: Path) -> None:
@@ -292,7 +292,7 @@ async def test_a_stopped_container_ends_its_run_for_another_try(zygote: Zygote, 
 async def _waiting(zygote: Zygote) -> int:
     """The child that is forked ahead, once it is there."""
     pid = zygote.process.pid  # type: ignore[attr-defined]
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not (found := [each for each in children_of(pid) if not _gone(each)]):
             await asyncio.sleep(0.005)
     return found[0]
@@ -328,7 +328,7 @@ async def test_a_cancel_before_the_handler_begins(zygote: Zygote) -> None:
     waiting = await _waiting(zygote)
     os.kill(waiting, signal.SIGSTOP)
     await connection.send({"op": "run", "run": "r1", "skill": "probe", "params": {"do": "echo"}})
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while True:
             await control.send({"op": "cancel", "run": "r1"})
             if (await control.receive())["ok"]:

@@ -95,7 +95,7 @@ class Fleet:
 
     async def answered(self, count: int) -> None:
         """Wait for so many answers."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while len(self.acks) < count:
                 await asyncio.sleep(0)
         for _ in range(3):

@@ -577,7 +577,7 @@ class Bench:
 
     async def ordered(self) -> tuple[str, RunRequest]:
         """Wait for the next run order."""
-        return await asyncio.wait_for(self.around.orders.get(), 5)
+        return await asyncio.wait_for(self.around.orders.get(), 60)
 
     def tell(self, request: RunRequest, kind: RunEventKind, *, gateway: str = "gw-1", **fields: Any) -> None:
         """Have a run tell something."""
@@ -594,12 +594,12 @@ class Bench:
         assert self.driver is not None
         outcome: asyncio.Future[TaskRecord] = asyncio.get_running_loop().create_future()
         self.driver.tell(Steered(ask=ask, outcome=outcome))
-        return await asyncio.wait_for(outcome, 5)
+        return await asyncio.wait_for(outcome, 60)
 
     async def until(self, holds: Callable[[TaskRecord], bool]) -> TaskRecord:
         """Wait until the record is so."""
         assert self.driver is not None
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             while not holds(self.driver.record):
                 await asyncio.sleep(0.005)
         return self.driver.record
@@ -608,7 +608,7 @@ class Bench:
         """Wait for the driver's end; returns its record."""
         assert self.task is not None
         assert self.driver is not None
-        await asyncio.wait_for(self.task, 5)
+        await asyncio.wait_for(self.task, 60)
         return self.driver.record
 
     def transitions(self, task: str = "t-1") -> list[Transition]:

@@ -193,13 +193,13 @@ async def test_a_stopped_robot_is_given_no_command(
     plane.session.replies = [encode(RobotReply(id="t-1/s1/1", result={"at": "dock"}))]
     reasons.append("stopped by ann: a person")
     command = asyncio.create_task(calls(ask("command", verb="goto", args={})))
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not waits:
             await asyncio.sleep(0.005)
     assert set(waits) == {"waits for r1: stopped by ann: a person"}
     assert not plane.session.queries
     reasons.clear()
-    assert await asyncio.wait_for(command, 5) == {"at": "dock"}
+    assert await asyncio.wait_for(command, 60) == {"at": "dock"}
 
 
 async def test_a_robot_that_stays_stopped_is_an_error_in_time(hindered: tuple[Calls, list[str]], plane: Any) -> None:
@@ -220,11 +220,11 @@ async def test_a_command_that_a_stop_has_ended_is_no_failure_of_the_handler(
         encode(RobotReply(id="t-1/s1/1", failure=Failure(code="cancelled", message="stopped on request")))
     ]
     command = asyncio.create_task(calls(ask("command", verb="goto", args={})))
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not plane.session.queries:
             await asyncio.sleep(0.002)
     reasons.append("stopped by ann")
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not waits:
             await asyncio.sleep(0.005)
     assert not command.done()

@@ -21,7 +21,7 @@ from appliance.model import (
     Way,
     encode,
 )
-from appliance.tasks import machine, partials
+from appliance.tasks import machine, orders, partials
 from appliance.tasks.checkpoints import Checkpoint
 from appliance.tasks.machine import KEPT_CHOICES, Transition, TransitionKind
 from appliance.tasks.partials import MAX_PARTIAL_BYTES, Partials, shown
@@ -45,17 +45,19 @@ async def test_an_attempt_keeps_why_it_was_placed_and_chosen(bench: Any) -> None
     await bench.start()
     _, request = await bench.ordered()
     assert bench.driver.record.subtasks[0].attempts[0].placed == "none is there"
-    await asyncio.sleep(0.01)
     bench.tell(request, RunEventKind.STARTED, container="c1", phase=Phase.LOCAL_WARM)
-    record = await bench.until(lambda record: record.subtasks[0].state is SubtaskState.RUNNING)
-    assert record.subtasks[0].attempts[0].choice == CHOICE
+    await bench.until(lambda record: record.subtasks[0].state is SubtaskState.RUNNING)
+    await bench.until(lambda record: record.subtasks[0].attempts[0].choice == CHOICE)
     bench.tell(request, RunEventKind.SUCCEEDED)
     await bench.end()
     assert bench.stored().subtasks[0].attempts[0].choice == CHOICE
 
 
-async def test_a_run_that_ends_before_its_order_is_answered_is_explained_too(bench: Any) -> None:
+async def test_a_run_that_ends_before_its_order_is_answered_is_explained_too(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The last subtask's end waits a moment for the answer that says how its container was chosen."""
+    monkeypatch.setattr(orders, "ANSWER_S", 60.0)
     bench.around.choice = CHOICE
     bench.around.slow_answer = asyncio.Event()
     await bench.start()
@@ -88,7 +90,7 @@ async def test_the_next_attempt_goes_on_from_the_last_checkpoint(bench: Any) -> 
     bench.tell(request, RunEventKind.CHECKPOINT, note="kept")
     record = await bench.until(lambda record: record.subtasks[0].checkpoint_ns > 0)
     assert record.subtasks[0].state is SubtaskState.DISPATCHED
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not bench.stored().subtasks[0].checkpoint_ns:
             await asyncio.sleep(0.005)
     bench.tell(request, RunEventKind.FAILED, failure=Failure(code="pool", message="died", retryable=True))

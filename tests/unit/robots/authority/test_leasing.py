@@ -79,7 +79,7 @@ async def test_what_an_operator_orders_is_held_to_the_robots_limits(plane: FakeP
 
 async def until(holds: Callable[[], bool]) -> None:
     """Wait until it is so."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not holds():
             await asyncio.sleep(0.005)
 

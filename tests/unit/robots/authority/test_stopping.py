@@ -28,7 +28,7 @@ async def known(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> AsyncItera
 
 async def until(holds: Callable[[], bool]) -> None:
     """Wait until it is so."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not holds():
             await asyncio.sleep(0.005)
 

@@ -80,7 +80,7 @@ class Gateway:
 
     async def empty(self) -> None:
         """Wait until it is."""
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             await self.it.until_empty()
 
 
@@ -109,7 +109,7 @@ async def test_what_cannot_be_moved_yet_is_asked_for_again() -> None:
     gateway = Gateway(here("s1"))
     gateway.problems["s1"] = [RefusedError("no gateway takes s1: gw-2: it drains") for _ in range(3)]
     await gateway.it.drain(DrainAsk())
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while "no gateway takes s1" not in gateway.it.text:
             await asyncio.sleep(0.001)
     await gateway.empty()

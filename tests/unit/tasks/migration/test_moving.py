@@ -176,7 +176,7 @@ async def test_a_run_that_ends_meanwhile_is_not_moved(fleet: Fleet) -> None:
     """Its result counts, though a container was held and it was held itself."""
     fleet.gates["run_hold"] = asyncio.Event()
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not fleet.did("run_hold"):
             await asyncio.sleep(0.005)
     await _ends_where_it_was(fleet)
@@ -223,7 +223,7 @@ async def test_a_coordinator_that_dies_after_the_write_is_succeeded(
     fleet.gates["run_leave"] = asyncio.Event()
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
     await fleet.bench.until(lambda record: record.subtasks[0].attempt == 2)
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while fleet.bench.stored().subtasks[0].attempt != 2:
             await asyncio.sleep(0.005)
     fleet.bench.task.cancel()
@@ -244,13 +244,13 @@ async def test_a_move_can_be_called_off_until_its_record_is_written(fleet: Fleet
     """Then the run goes on where it was; later it is too late."""
     fleet.gates["run_hold"] = asyncio.Event()
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not fleet.did("run_hold"):
             await asyncio.sleep(0.005)
     assert (await fleet.moving.cancel(MoveAsk(task="t-1", subtask="s1"))).cancelled
     with pytest.raises(CancelledByOperatorError):
         await moving
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         while not (fleet.did("run_resume") and fleet.did("run_unreserve")):
             await asyncio.sleep(0.005)
     assert fleet.bench.driver.record.subtasks[0].attempt == 1
@@ -262,7 +262,9 @@ async def test_one_move_of_a_subtask_at_a_time(fleet: Fleet) -> None:
     """A second one is refused while the first is under way."""
     fleet.gates["run_reserve"] = asyncio.Event()
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
-    await asyncio.sleep(0.02)
+    async with asyncio.timeout(60):
+        while not fleet.did("run_reserve"):
+            await asyncio.sleep(0.005)
     with pytest.raises(RefusedError, match="already"):
         await fleet.moving.migrate(ASK)
     moving.cancel()
