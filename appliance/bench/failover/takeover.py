@@ -55,26 +55,45 @@ class Options(Struct, frozen=True, kw_only=True):
 
 
 class Heard:
-    """Which subtasks have succeeded, as it is published: heard by several clients, each linked to another gateway.
+    """Which runs have succeeded, as it is published: heard by several clients, each linked to another gateway.
 
     What is published while a client's own gateway is lost, and until it is linked to the next, that client misses.
     """
 
     def __init__(self, clients: Sequence[FleetClient]) -> None:
-        self._ended: set[tuple[str, str, int, str]] = set()
+        self._ended: dict[tuple[str, str], dict[int, set[str]]] = {}
+        """Task and subtask -> attempts that succeeded -> who has told so, as which transition of the record."""
         self._closers = [
             client.plane.session.subscribe_typed(client.plane.session.keys.transition(), Transition, self._take)
             for client in clients
         ]
 
     def _take(self, _: str, transition: Transition | None) -> None:
-        if transition is not None and transition.kind is TransitionKind.SUCCEEDED:
-            each = transition
-            self._ended.add((each.task, each.subtask, each.sequence, each.coordinator))
+        if transition is not None:
+            self.hear(transition)
 
-    def ends(self, tasks: Sequence[str]) -> Counter[tuple[str, str]]:
-        """How often each subtask of these tasks has succeeded."""
-        return Counter((task, subtask) for task, subtask, _, _ in self._ended if task in tasks)
+    def hear(self, told: Transition) -> None:
+        """Take note of a transition; the same one may come from several clients."""
+        if told.kind is TransitionKind.SUCCEEDED:
+            attempts = self._ended.setdefault((told.task, told.subtask), {})
+            attempts.setdefault(told.attempt, set()).add(f"{told.coordinator} #{told.sequence}")
+
+    def run_twice(self, tasks: Sequence[str]) -> list[str]:
+        """The subtasks of these tasks of which more than one attempt has succeeded, with who told so."""
+        return [
+            f"{task}/{subtask} succeeded in attempts {attempts}"
+            for (task, subtask), attempts in self._ended.items()
+            if task in tasks and len(attempts) > 1
+        ]
+
+    def told_twice(self, tasks: Sequence[str]) -> list[str]:
+        """Those of which one attempt's end was written by two coordinators: they did not see each other."""
+        return [
+            f"{task}/{subtask} attempt {attempt}: {', '.join(sorted(who))}"
+            for (task, subtask), attempts in self._ended.items()
+            for attempt, who in attempts.items()
+            if task in tasks and len(who) > 1
+        ]
 
     def close(self) -> None:
         """Listen no more."""
@@ -171,6 +190,7 @@ class _Rounds:
         parts: dict[str, list[float]] = {"settled": [], "taken_up": [], "written": []}
         tasks = 0
         problems: list[str] = []
+        told_twice: list[str] = []
         for number in range(rounds):
             names = await self._submit(f"{how}-{number}")
             records = await self._running(names)
@@ -202,6 +222,7 @@ class _Rounds:
             if how == "freeze":
                 self._arena.signal(victim, signal.SIGCONT)
             problems += await self._ended(heard, names)
+            told_twice += heard.told_twice(names)
             tasks += len(names)
             if how == "kill":
                 self._arena.start(victim)
@@ -212,6 +233,7 @@ class _Rounds:
             "tasks": tasks,
             "tasks_taken_over": len(adopted),
             "not_exactly_once": problems,
+            "told_by_two": told_twice,
             "detected": summary(detected),
             "detected_by_all": summary(by_all),
             "adopted_after_detection": summary(adopted),
@@ -242,7 +264,7 @@ class _Rounds:
             if len(under_way) >= len(names) // 2 or (under_way and time.monotonic() > give_up - STEP_S / 2):
                 return under_way
             failed = [each for each in records if each.failure is not None]
-            if failed or time.monotonic() > give_up:
+            if failed or all(each.state.final for each in records) or time.monotonic() > give_up:
                 states = Counter(str(each.state) for each in records)
                 why = failed[0].failure.message if failed and failed[0].failure is not None else ""
                 raise DeadlineError(f"the tasks do not run: {dict(states)} {why}", remedy="see the gateways' logs")
@@ -296,6 +318,5 @@ class _Rounds:
                 await asyncio.sleep(0.1)
             records.append(record)
         await asyncio.sleep(0.2)  # what was published with the last records arrives
-        ends = heard.ends(names)
         wrong = [f"{each.id} {each.state}" for each in records if each.state is not TaskState.SUCCEEDED]
-        return wrong + [f"{task}/{subtask} ended {times} times" for (task, subtask), times in ends.items() if times > 1]
+        return wrong + heard.run_twice(names)

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from appliance.bench.failover.logs import LogTail, wall_s
-from appliance.bench.failover.takeover import adoptions
+from appliance.bench.failover.takeover import Heard, adoptions
 from appliance.errors import DeadlineError
+from appliance.tasks.machine import Transition, TransitionKind
 
 pytestmark = pytest.mark.anyio
 
@@ -61,3 +62,21 @@ def test_takeovers_are_read_from_the_successors_logs() -> None:
     assert found["t-1"].parts(seen_at) == pytest.approx({"settled": 150.0, "taken_up": 30.0, "written": 20.0}, abs=0.1)
     # A shard that was compared before the loss was seen is not what it waited for.
     assert found["t-3"].parts(seen_at) == pytest.approx({"settled": 0.0, "taken_up": 443.0, "written": 7.0}, abs=0.1)
+
+
+def test_a_run_that_two_coordinators_tell_of_is_one_run() -> None:
+    """Twice the same transition is one, two of the same attempt were one run, two attempts that succeeded are two."""
+    heard = Heard(())
+    for task, attempt, coordinator, sequence in (
+        ("t-1", 1, "gw-1", 5), ("t-1", 1, "gw-1", 5), ("t-2", 1, "gw-1", 5), ("t-2", 1, "gw-2", 6),
+        ("t-3", 1, "gw-1", 5), ("t-3", 2, "gw-2", 7),
+    ):  # fmt: skip
+        told = Transition(
+            task=task, sequence=sequence, kind=TransitionKind.SUCCEEDED, at_ns=1, coordinator=coordinator,
+            subtask="s1", attempt=attempt,
+        )  # fmt: skip
+        heard.hear(told)
+    tasks = ("t-1", "t-2", "t-3")
+    assert [each.split()[0] for each in heard.run_twice(tasks)] == ["t-3/s1"]
+    assert heard.told_twice(tasks) == ["t-2/s1 attempt 1: gw-1 #5, gw-2 #6"]
+    assert heard.run_twice(tasks[:2]) == heard.told_twice(tasks[:1]) == []
