@@ -153,6 +153,11 @@ class Pool:
         return facts is not None and facts.limits_enforced
 
     @property
+    def federated(self) -> bool:
+        """Whether runs that come here may be served by other gateways' containers (`pool.mode`)."""
+        return self._config.mode == "federated"
+
+    @property
     def queue(self) -> int:
         """Runs that wait for a container."""
         return self._keeper.books.queue
@@ -213,7 +218,7 @@ class Pool:
         offers: list[Candidate] = []
         decision = self._choose(need, offers, facts)
         wanting = decision.phase is Phase.COLD or decision.way is Way.BRING_HERE
-        if wanting and allow_remote and self._config.mode == "federated":
+        if wanting and allow_remote and self.federated:
             # Not held while others are asked: a container that another run could use must not wait for that.
             try:
                 async with asyncio.timeout(self._config.remote_timeout_s):

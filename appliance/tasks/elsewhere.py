@@ -232,12 +232,18 @@ class Elsewhere:
         self._offers.pop(run_id, None)
         self._under_way.discard(run_id)
 
-    def offered(self, run_id: str, *, taken: bool) -> None:
-        """Note what came of an offer; one that was not taken is made again after a pause."""
+    def offered(self, run_id: str, *, taken: bool, container: str = "") -> None:
+        """Note what came of an offer; one that was not taken is made again after a pause.
+
+        Args:
+            run_id: what was offered.
+            taken: whether the other gateway has it.
+            container: the one that it got there.
+        """
         offer = self._offers.pop(run_id)
         self._under_way.discard(run_id)
         if not offer.anew:
-            self._remote.turned_out(offer.gateway, good=taken)
+            self._remote.turned_out(offer.gateway, good=taken, container=container)
         if taken:
             self._tries.pop(run_id, None)
             self._remote.searches["moved"] += 1

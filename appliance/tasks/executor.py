@@ -239,7 +239,7 @@ class Executor:
                 avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}
                 self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
             else:
-                remote.turned_out(gateway, good=True)
+                remote.turned_out(gateway, good=True, container=accepted.container)
                 return passed_on(accepted, explained(decision, avoid))
         raise PoolError("a selection without other gateways chose one")
 

@@ -51,8 +51,9 @@ class Passing:
         """Runs that were passed on after they had been accepted here, with the gateway that has them."""
 
     def start(self) -> None:
-        """Begin to offer those who wait."""
-        self._elsewhere.start()
+        """Begin to offer those who wait; a pool that keeps to itself lets them wait."""
+        if self._pool.federated:
+            self._elsewhere.start()
 
     def stop(self) -> None:
         """Offer nothing more."""
@@ -107,18 +108,18 @@ class Passing:
             decision = replace(decision, container=None, reservation="")
 
     async def _pass_on(self, request: RunRequest, offer: Offer, since: float) -> PassedOn | None:
-        run_id, taken = request.run_id, False
+        run_id, taken, container = request.run_id, False, ""
         order = replace(request, hops=1, anew=offer.anew)
         try:
             accepted = await self._plane.rpc.call(offer.gateway, "run", order, RunAccepted, timeout_s=ORDER_S)
-            taken = True
+            taken, container = True, accepted.container
         except DeadlineError as error:
             raise UnreachableError(f"{offer.gateway} did not say whether it runs {run_id}") from error
         except SwiftbotError as error:
             self._plane.session.refuse("stale offer", key=offer.gateway, run=run_id, reason=error.message)
             return None
         finally:
-            self._elsewhere.offered(run_id, taken=taken)
+            self._elsewhere.offered(run_id, taken=taken, container=container)
         self.moved[run_id] = accepted.gateway
         why = f"waited {time.monotonic() - since:.1f} s on {self._plane.gateway}, then {offer.why}"
         choice = accepted.choice and replace(

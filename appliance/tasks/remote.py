@@ -11,9 +11,10 @@ date, or it lies.
 """
 
 import asyncio
+import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from msgspec import Struct
@@ -35,8 +36,12 @@ FRESH_S = 10.0
 """What was heard of a gateway within this time is believed without asking: it tells its status every few seconds and
 every change of a container at once, so silence for longer means that something is lost on the way."""
 PROMISED_S = 0.25
-"""For how long a container to which a run was sent is not counted on any more: by then its gateway has said that it is
-busy (changes are told after 20 ms), or that it is not."""
+"""For how long at most a container to which a run was sent is not counted on any more: by then its gateway has told
+that it is busy (changes are told after 20 ms), or has had a run more."""
+PATIENCE = 2.0
+"""Once somebody has offered all that is needed, the others are waited for until so many times as long as that took: a
+slower one is dearer anyhow, and one that does not answer would cost the whole of `ASK_TIMEOUT_S`."""
+LEAST_PATIENCE_S = 0.002
 EMPTY_OFFERS = 3
 """Offers in a row that were nothing, after which a gateway is left out; one or two are lost races."""
 MOST_PROMISED = 64
@@ -78,6 +83,16 @@ class _Trust(Struct):
     until: float = 0.0
 
 
+class _Sent(Struct):
+    """A run that was sent to a gateway. It holds one of its ready containers until that one is told of anew."""
+
+    until: float
+    runs: dict[str, int]
+    """Container -> how many runs it had had, of those that were ready there when it was sent."""
+    container: str = ""
+    """The one that it got; empty while that is not known."""
+
+
 class RemoteContainers:
     """Finds ready containers on other gateways, and answers when others look for ours.
 
@@ -93,8 +108,8 @@ class RemoteContainers:
         self._links = links
         self._round_trip_ms: dict[str, float] = {}
         self._trust: dict[str, _Trust] = {}
-        self._promised: dict[str, list[float]] = {}
-        """Gateway -> until when each of the runs sent to it counts as having one of its ready containers."""
+        self._sent: dict[str, list[_Sent]] = {}
+        """Gateway -> the runs that were sent to it of late."""
         self._doubted: dict[str, float] = {}
         """Gateway -> until when what is known of its containers is not believed: it had none when it was asked."""
         self.searches: Counter[str] = Counter()
@@ -111,10 +126,7 @@ class RemoteContainers:
         self.searches["saved"] += len(near) - len(asked)
         self.searches["asked"] += len(asked)
         taken = {(each.gateway, each.id) for each in self._promised_ones(found.values())}
-        answers = await asyncio.gather(*(self._ask(each, need) for each in asked))
-        for gateway, containers in zip(asked, answers, strict=True):
-            if containers is None:
-                continue
+        for gateway, containers in (await self._ask_all(asked, need)).items():
             # Whoever answers has counted in what was sent to it: short runs are over before anything was told.
             taken = {key for key in taken if key[0] != gateway}
             # What a gateway says of its own containers is newer than what was heard of them.
@@ -162,28 +174,68 @@ class RemoteContainers:
         return registry.age_s(gateway) <= FRESH_S or registry.keeps_promise(gateway)
 
     def _promised_ones(self, containers: Iterable[ContainerInfo]) -> list[ContainerInfo]:
-        """As many ready containers of each gateway as runs were just sent to it; it picks them itself."""
-        now = time.monotonic()
+        """The ready containers that runs were just sent to; where it is not known which, as many as runs were sent."""
         ready: dict[str, list[ContainerInfo]] = {}
         for each in containers:
-            if each.state is ContainerState.READY and each.gateway in self._promised:
+            if each.state is ContainerState.READY and each.gateway in self._sent:
                 ready.setdefault(each.gateway, []).append(each)
         found: list[ContainerInfo] = []
         for gateway, held in ready.items():
-            held.sort(key=lambda each: each.id)
-            found += held[: sum(until > now for until in self._promised[gateway])]
+            sent = self._open(gateway)
+            got = {each.container for each in sent}
+            found += [each for each in held if each.id in got]
+            left = sorted((each for each in held if each.id not in got), key=lambda each: each.id)
+            found += left[: sum(not each.container for each in sent)]
         return found
+
+    def _open(self, gateway: str) -> list[_Sent]:
+        """The runs that were sent to a gateway and of which it has not told yet."""
+        now, known = time.monotonic(), self._plane.registry.containers.get(gateway, {})
+
+        def untold(sent: _Sent) -> bool:
+            container = known.get(sent.container)
+            return not sent.container or (
+                container is not None
+                and container.state is ContainerState.READY
+                and container.runs == sent.runs.get(sent.container, container.runs)
+            )
+
+        return [each for each in self._sent.get(gateway, ()) if each.until > now and untold(each)]
 
     def _sent_to(self, gateway: str) -> bool:
         """Whether a run was sent to it so lately that it has not told of it yet."""
-        now = time.monotonic()
-        return any(until > now for until in self._promised.get(gateway, ()))
+        return bool(self._open(gateway))
 
     def promise(self, gateway: str) -> None:
         """Note that a run is being sent to a gateway: one of its ready containers is spoken for."""
-        now = time.monotonic()
-        sent = [until for until in self._promised.get(gateway, ()) if until > now]
-        self._promised[gateway] = [*sent[-MOST_PROMISED:], now + PROMISED_S]
+        known = self._plane.registry.containers.get(gateway, {})
+        runs = {each.id: each.runs for each in known.values() if each.state is ContainerState.READY}
+        sent = self._open(gateway)[-MOST_PROMISED:]
+        self._sent[gateway] = [*sent, _Sent(until=time.monotonic() + PROMISED_S, runs=runs)]
+
+    async def _ask_all(self, gateways: Sequence[str], need: Need) -> dict[str, tuple[ContainerInfo, ...]]:
+        """Ask at the same time; once one offers all that is needed, the rest is not waited for to the end."""
+        began = time.monotonic()
+        asking = {asyncio.create_task(self._ask(each, need), name=f"ask {each}"): each for each in gateways}
+        answers: dict[str, tuple[ContainerInfo, ...]] = {}
+        pending, until = set(asking), math.inf
+        try:
+            while pending and (left_s := until - time.monotonic()) > 0:
+                done, pending = await asyncio.wait(
+                    pending, timeout=min(left_s, 2 * ASK_TIMEOUT_S), return_when=asyncio.FIRST_COMPLETED
+                )
+                for each in done:
+                    gateway, containers = asking[each], each.result()
+                    if containers is None:
+                        continue
+                    answers[gateway] = containers
+                    if until == math.inf and any(_is_all(one, need) and one.gateway == gateway for one in containers):
+                        took_s = time.monotonic() - began
+                        until = began + max(PATIENCE * took_s, took_s + LEAST_PATIENCE_S)
+        finally:
+            for each in pending:
+                each.cancel()
+        return {each: answers[each] for each in gateways if each in answers}
 
     async def _ask(self, gateway: str, need: Need) -> tuple[ContainerInfo, ...] | None:
         began = time.monotonic()
@@ -193,10 +245,17 @@ class RemoteContainers:
             )
         except SwiftbotError:
             return None
+        except asyncio.CancelledError:  # others were quicker: it takes this long at least
+            if time.monotonic() - began > self._round_trip_ms.get(gateway, 0.0) / 1e3:
+                self._measured(gateway, began)
+            raise
+        self._measured(gateway, began)
+        return answer.containers
+
+    def _measured(self, gateway: str, began: float) -> None:
         took_ms = (time.monotonic() - began) * 1e3
         before = self._round_trip_ms.get(gateway, took_ms)
         self._round_trip_ms[gateway] = 0.8 * before + 0.2 * took_ms
-        return answer.containers
 
     def _known(self, need: Need) -> list[ContainerInfo]:
         return [
@@ -249,8 +308,15 @@ class RemoteContainers:
             if trust.until > at
         }
 
-    def turned_out(self, gateway: str, *, good: bool, now: Callable[[], float] = time.monotonic) -> None:
-        """Note whether a container that a gateway offered was there."""
+    def turned_out(
+        self, gateway: str, *, good: bool, container: str = "", now: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Note whether a container that a gateway offered was there, and which one the run that was sent there got."""
+        sent = next((each for each in self._sent.get(gateway, ()) if not each.container), None)
+        if sent is not None and good:
+            sent.container = container
+        elif sent is not None:
+            self._sent[gateway].remove(sent)
         if good:
             self._trust.pop(gateway, None)
             return
@@ -262,7 +328,18 @@ class RemoteContainers:
             trust.until = now() + min(LEFT_OUT_S, FIRST_LEFT_OUT_S * 2**doublings)
 
     def _forget(self, gateway: str) -> None:
-        self._promised.pop(gateway, None)
+        self._sent.pop(gateway, None)
         self._doubted.pop(gateway, None)
         self._round_trip_ms.pop(gateway, None)
         self._trust.pop(gateway, None)
+
+
+def _is_all(container: ContainerInfo, need: Need) -> bool:
+    """Whether no other container could serve a need better."""
+    return (
+        container.state is ContainerState.READY
+        and container.image == need.image
+        and container.cpu >= need.cpu
+        and container.memory_mb >= need.memory_mb
+        and set(need.volumes) <= set(container.volumes)
+    )

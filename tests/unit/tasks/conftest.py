@@ -291,6 +291,7 @@ class FakePool:
         self.line: list[tuple[Turn, Need]] = []
         self.full = False
         self.room = True
+        self.federated = True
 
     async def select(
         self,

@@ -180,6 +180,21 @@ async def test_a_waiting_run_goes_where_a_container_becomes_ready(executor: Exec
     assert executor._remote.searches["moved"] == 1
 
 
+async def test_a_pool_that_keeps_to_itself_offers_nothing(plane: Any, pool: Any, tasks_config: Any) -> None:
+    """With `pool.mode` local or cold, which are there to be compared with, a run waits where it was ordered."""
+    pool.full, pool.federated = True, False
+    pool.decision = Decision(phase=Phase.COLD, gateway="gw-1", way=Way.NEW, why="a new one")
+    executor = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    await executor.start()
+    await executor.run(REQUEST)
+    await until(lambda: pool.line)
+    hear_of(plane, "gw-2")
+    await asyncio.sleep(0.1)
+    assert len(pool.line) == 1
+    assert not plane.rpc.calls
+    executor._passing.stop()
+
+
 async def test_a_run_that_is_not_taken_goes_back_to_its_place(executor: Executor, plane: Any, pool: Any) -> None:
     """The container was gone: it waits here again since it first came, is offered again later, and ends here."""
 

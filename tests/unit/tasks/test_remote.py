@@ -1,5 +1,6 @@
 """What is known of containers and state elsewhere: whose word counts, what is out of date, what things cost."""
 
+import asyncio
 from typing import Any
 
 import pytest
@@ -160,3 +161,50 @@ async def test_short_runs_one_after_the_other_find_the_same_container(remote: Re
         assert remote.ready(NEED) == []
         assert await found(remote) == {"a": READY}
     assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-2"] * 3
+
+
+async def test_a_run_holds_its_container_until_that_one_is_told_of(remote: RemoteContainers, plane: Any) -> None:
+    """Once it is known which one a run got, the others are counted on, and it too as soon as it is told of anew."""
+    know(plane, container("gw-2", "a", runs=3), container("gw-2", "b"))
+    plane.registry.ages = {"gw-2": 0.1}
+    remote.promise("gw-2")
+    assert {each.id for each in remote.ready(NEED)} == {"b"}
+    remote.turned_out("gw-2", good=True, container="b")
+    assert {each.id for each in remote.ready(NEED)} == {"a"}
+    know(plane, container("gw-2", "b", BUSY))
+    remote.promise("gw-2")
+    remote.turned_out("gw-2", good=True, container="a")
+    assert remote.ready(NEED) == []
+    know(plane, container("gw-2", "a", runs=4))  # so short that it was never told to be busy
+    assert {each.id for each in remote.ready(NEED)} == {"a"}
+
+
+async def test_an_offer_that_came_to_nothing_holds_no_container(remote: RemoteContainers, plane: Any) -> None:
+    """A run that was refused has none: when its gateway is believed again, all that are ready there count."""
+    know(plane, container("gw-2", "a"))
+    plane.registry.ages = {"gw-2": 0.1}
+    remote.promise("gw-2")
+    remote.turned_out("gw-2", good=False)
+    assert not remote._open("gw-2")
+
+
+async def test_the_slowest_is_not_waited_for_when_another_has_all_that_is_needed(
+    remote: RemoteContainers, plane: Any
+) -> None:
+    """One that never answers does not hold up a search that has found a container; one that is not enough does."""
+    never = asyncio.Event()
+    offer = container("gw-2", "a", cpu=8.0, memory_mb=8192, volumes=NEED.volumes)
+
+    async def find(gateway: str, need: Need) -> ContainerList:
+        if gateway == "gw-3":
+            await never.wait()
+        return ContainerList(containers=(offer,))
+
+    plane.rpc.on["find_containers"] = find
+    assert await asyncio.wait_for(found(remote), 30) == {"a": READY}
+    offer = container("gw-2", "a", cpu=8.0, memory_mb=8192, volumes=())
+    looking = asyncio.create_task(found(remote))
+    done, _ = await asyncio.wait([looking], timeout=0.05)
+    assert not done, "volumes are missing there: the other may have them"
+    never.set()
+    assert await asyncio.wait_for(looking, 30) == {"a": READY}
