@@ -10,9 +10,14 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from appliance.errors import NotFoundError, RecordError
+from appliance.model import LogLine, encode
+from appliance.plane.keys import Keys
 from appliance.record.edit import recover
 from appliance.record.facts import LoggedMessage
+from appliance.record.openlog import Attached
 from appliance.record.reader import info, read
+from appliance.record.settings import RecordConfig
+from appliance.record.writer import LogWriter
 
 MAGIC_BYTES = 8
 
@@ -200,3 +205,53 @@ def test_recovering_garbage_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="not an MCAP file"):
         recover(tmp_path / "bad", tmp_path / "out.mcap")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
+
+
+def _recorded(folder: Path) -> Path:
+    """Return a file of the recorder's own: lines with what is derived from them, frames, gaps, an attachment."""
+    config = RecordConfig(directory=str(folder), free_bytes=0, fsync=False, total_bytes=0)
+    attached = Attached("gateway.toml", "application/toml", b'id = "gw-1"\n')
+    writer = LogWriter(config, fleet="f1", attached=(attached,))
+    writer.prepare()
+    keys = Keys("f1")
+    for number in range(8):
+        line = encode(LogLine(at_ns=1000 + number, level="info", source="gw-1", event=f"started {number}"))
+        writer.write(LoggedMessage(keys.log("gw-1"), 1000 + number, line, "application/json"))
+        writer.write(
+            LoggedMessage(keys.mavlink("r1", "rx"), 1000 + number, bytes(range(30)), "application/octet-stream")
+        )
+        if number % 3 == 2:
+            writer.drop("queue full", keys.log("gw-1"), 10, 1000 + number)
+            writer.tick()
+    writer.close()
+    return writer.files[0]
+
+
+def test_the_recorders_own_file_damaged_at_every_offset(tmp_path: Path) -> None:
+    """A byte changed, and the file cut, at each place in turn: what is read was written, and what lacks is told."""
+    whole = _recorded(tmp_path / "logs").read_bytes()
+    log = tmp_path / "damaged.mcap"
+    log.write_bytes(whole)
+    written = list(read(log))
+    assert len(written) > 16
+    for where in range(MAGIC_BYTES, len(whole)):
+        log.write_bytes(whole[:where] + bytes((whole[where] ^ 0xFF,)) + whole[where + 1 :])
+        problems: list[str] = []
+        found = list(read(log, problems=problems))
+        assert all(each in written for each in found), where
+        assert len(found) == len(written) or problems or info(log).recovered, where
+        if where % 8 == 0:
+            log.write_bytes(whole[:where])
+            found = list(read(log))
+            assert found == written[: len(found)], where
+        if where % 128 == 0:
+            _check_recovered(log, tmp_path / f"{where}.mcap", written)
+
+
+def _check_recovered(log: Path, out: Path, written: list[LoggedMessage]) -> None:
+    try:
+        recover(log, out)
+    except RecordError:
+        assert not out.exists()
+    else:
+        assert all(each in written for each in read(out))
