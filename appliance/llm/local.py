@@ -22,7 +22,9 @@ from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import words_of
 from appliance.llm.process import ModelProcess
 from appliance.llm.prompt import messages
+from appliance.llm.safety.contradictions import contradictions
 from appliance.llm.schema import plan_grammar, read_plan, robot_names
+from appliance.llm.sense import Meaning, problems
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.speaking import Question, Said
 from appliance.llm.tier import Proposal
@@ -39,6 +41,8 @@ _NO_PLAN = {
     "unclear": "it does not say what to do, or with what",
     "language": "only English is understood",
 }
+_UNSOUND = 0.1
+"""How sure it can be of a plan that breaks a rule of plans; of held-out instructions none such was right."""
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (
@@ -265,28 +269,49 @@ class LocalTier:
         question = Question(
             text=context.instruction, robots=robots, skills=self._shapes, deadline_s=self._config.local_deadline_s
         )
-        reply = await process.exchange({"question": msgspec.to_builtins(question)})
-        said = _said(reply)
+        likeliest: Proposal | None = None
+        # What breaks a rule of plans was not meant; the next likely answer that breaks none was. Where all do, others
+        # are looked for once.
+        for thorough in (False, True):
+            said = await self._asked(process, msgspec.structs.replace(question, thorough=thorough))
+            proposals = self._read(said, context, process)
+            likeliest = likeliest or proposals[0]
+            for each in proposals:
+                if not self._unsound(each.plan, context):
+                    return each
+        # With its problems, for whoever repairs or refuses it, and at most for an operator to look at.
+        return msgspec.structs.replace(likeliest, confidence=min(likeliest.confidence, _UNSOUND))
+
+    async def _asked(self, process: ModelProcess, question: Question) -> Said:
+        said = _said(await process.exchange({"question": msgspec.to_builtins(question)}))
         self._note(said.tokens, said.ms, 0)
         log.debug("local model answered", symbols=" ".join(said.symbols), confidence=said.confidence, ms=said.ms)
-        words = words_of(context.instruction, robots or ())
+        return said
+
+    def _read(self, said: Said, context: PlanContext, process: ModelProcess) -> list[Proposal]:
+        """Return the answers as plans, likelier ones first; PlanError when the likeliest is none, or a refusal."""
+        words = words_of(context.instruction, [robot.id for robot in context.robots or ()])
         answer = read(said.symbols, words, self._catalogue)
         if answer.refused:
             raise PlanError(f"there is nothing to do: {_NO_PLAN.get(answer.refused, answer.refused)}")
-        # What breaks a rule of plans was not meant; the next likely answer that breaks none was.
-        chosen = best = _proposed(answer, said.confidence, process)
-        others = iter(said.others)
-        while self._unsound(chosen, context):
-            other = next(others, None)
-            if other is None:
-                return best  # with its problems, for whoever repairs or refuses it
+        found = [_proposed(answer, said.confidence, process)]
+        for other in said.others:
             with contextlib.suppress(PlanError):
-                chosen = _proposed(read(other.symbols, words, self._catalogue), other.confidence, process)
-        return chosen
+                found.append(_proposed(read(other.symbols, words, self._catalogue), other.confidence, process))
+        return found
 
-    def _unsound(self, proposal: Proposal, context: PlanContext) -> bool:
-        plan = proposal.plan
-        return not plan.subtasks or bool(validate(plan, self._catalogue, robots=context.robots, site=context.site))
+    def _unsound(self, plan: Plan, context: PlanContext) -> bool:
+        """Whether a plan breaks a rule that all plans keep, or contradicts itself.
+
+        The safety policy has no say: what is forbidden is refused, and nothing else done in its place.
+        """
+        if not plan.subtasks or validate(plan, self._catalogue, robots=context.robots, site=context.site):
+            return True
+        if any(contradictions(plan)):
+            return True
+        robots = tuple(robot.id for robot in context.robots or ())
+        meaning = Meaning(instruction=context.instruction, robots=robots, domain=plan.domain, subtasks=plan.subtasks)
+        return bool(problems(meaning, self._catalogue))
 
     def _note(self, tokens: int, ms: float, reused: int) -> None:
         self._answered += 1

@@ -7,6 +7,7 @@ A model folder has, beside what the library needs, `planner.json`: which token i
 a confidence.
 """
 
+import heapq
 import math
 import time
 from collections.abc import Callable
@@ -23,13 +24,13 @@ from appliance.llm.language.words import MAX_WORDS, words_of
 CARD = "planner.json"
 MOST_SYMBOLS = 600
 """Of an answer; a longer one is none."""
-TURNS = 3
+TURNS, THOROUGH = 3, 12
 """Answers that are tried besides the one that is likeliest step by step; each takes half an answer's time or so."""
 MOST_OF = 0.5
 """Share of the time for an answer after which no other one is begun or gone on with."""
-LONGER = 2
+LONGER, THOROUGH_LONGER = 2, 8
 """Times the symbols of the first answer that the others may have together."""
-FAIR = 0.08
+FAIR, THOROUGH_FAIR = 0.08, 0.02
 """Share of a symbol from which on it is worth an answer of its own."""
 
 
@@ -51,6 +52,8 @@ class Question(Struct, frozen=True, kw_only=True):
     robots: tuple[str, ...] | None
     skills: dict[str, SkillShape]
     deadline_s: float
+    thorough: bool = False
+    """Whether more answers are tried: for a question whose usual ones all broke a rule of plans."""
 
 
 class Other(Struct, frozen=True):
@@ -160,14 +163,21 @@ class Speaker:
         paths, said = [first], first.tokens
         # An answer is there: what the others may take is bounded, by symbols, so that the same words get the same plan.
         until = began + MOST_OF * question.deadline_s
-        left = LONGER * len(first.symbols)
+        turns_most, longer, fair = (
+            (THOROUGH, THOROUGH_LONGER, THOROUGH_FAIR) if question.thorough else (TURNS, LONGER, FAIR)
+        )
         spoken = len(first.symbols)
-        turns = sorted((turn for turn in first.turns if turn.share >= FAIR), key=lambda turn: turn.cost)
-        for turn in turns[:TURNS]:
+        left = longer * spoken
+        # The cheapest turns first, of whatever answer; the number keeps equal ones in the order they were found in.
+        turns = [(turn.cost, number, turn, first) for number, turn in enumerate(first.turns) if turn.share >= fair]
+        heapq.heapify(turns)
+        found = len(turns)
+        while turns and len(paths) <= turns_most and left > 0:
+            _, _, turn, trunk = heapq.heappop(turns)
             other = guide()
-            for symbol in first.symbols[: turn.at]:
+            for symbol in trunk.symbols[: turn.at]:
                 other.take(symbol)
-            begun = Spoken(symbols=first.symbols[: turn.at], tokens=first.tokens[: turn.at], cost=turn.cost)
+            begun = Spoken(symbols=trunk.symbols[: turn.at], tokens=trunk.tokens[: turn.at], cost=turn.cost)
             _set_back(generator, len(prompt), said, begun.tokens)
             said = begun.tokens
             try:
@@ -180,6 +190,10 @@ class Speaker:
                 break  # there is an answer
             spoken += len(begun.symbols) - turn.at
             left -= len(begun.symbols) - turn.at
+            for each in begun.turns:
+                if each.share >= fair:
+                    found += 1
+                    heapq.heappush(turns, (each.cost, found, each, begun))
         paths.sort(key=lambda path: path.cost)
         return Said(
             symbols=tuple(paths[0].symbols),

@@ -7,6 +7,7 @@ import pytest
 from appliance.errors import PlanError
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.tier import Proposal
 from appliance.model import RobotInfo
 from appliance.skills.catalogue import load_catalogue
 
@@ -22,15 +23,27 @@ UNREADABLE = ["navigation", "goto", "w99", "w99", "place:", "w3", "w4"]
 REFUSED = ["none", "chatter"]
 
 
+Answers = list[tuple[list[str], float]]
+
+
 class Model:
-    """A model's process that answers what it was made with, likeliest first."""
+    """A model's process that answers what it was made with, likeliest first; what it is asked is kept."""
 
     folder = "/models/fake"
     speaks = True
 
-    def __init__(self, *answers: tuple[list[str], float]) -> None:
-        (symbols, confidence), *others = answers
-        self.reply: dict[str, Any] = {
+    def __init__(self, answers: Answers, thorough: Answers | None = None) -> None:
+        self._answers = {False: answers, True: thorough or answers}
+        self.asked: list[bool] = []
+
+    async def ready(self) -> None:
+        """It is."""
+
+    async def exchange(self, order: dict[str, Any]) -> dict[str, Any]:
+        """Answer."""
+        self.asked.append(order["question"]["thorough"])
+        (symbols, confidence), *others = self._answers[self.asked[-1]]
+        return {
             "symbols": symbols,
             "confidence": confidence,
             "others": [{"symbols": each, "confidence": sure} for each, sure in others],
@@ -38,19 +51,17 @@ class Model:
             "ms": 5.0,
         }
 
-    async def ready(self) -> None:
-        """It is."""
 
-    async def exchange(self, _: dict[str, Any]) -> dict[str, Any]:
-        """Answer."""
-        return self.reply
+async def proposed(model: Model, context: PlanContext = CONTEXT) -> Proposal:
+    """Return what the tier proposes."""
+    tier = LocalTier(LlmConfig(local_model=Model.folder), CATALOGUE)
+    tier._process = model  # pyright: ignore[reportAttributeAccessIssue]
+    return await tier.propose(context)
 
 
 async def asked(*answers: tuple[list[str], float]) -> tuple[dict[str, object], float]:
     """Return parameters and confidence of what the tier proposes."""
-    tier = LocalTier(LlmConfig(local_model=Model.folder), CATALOGUE)
-    tier._process = Model(*answers)  # pyright: ignore[reportAttributeAccessIssue]
-    proposal = await tier.propose(CONTEXT)
+    proposal = await proposed(Model(list(answers)))
     return proposal.plan.subtasks[0].params, proposal.confidence
 
 
@@ -61,8 +72,34 @@ async def test_the_likeliest_answer_that_breaks_no_rule_is_taken() -> None:
 
 
 async def test_when_all_break_a_rule_the_likeliest_is_told() -> None:
-    """Its problems are what repair and refusal go by."""
-    assert await asked((NOWHERE, 0.8), (UNREADABLE, 0.1), (NOWHERE, 0.05)) == ({}, 0.8)
+    """Its problems are what repair and refusal go by; nobody is sure of it, whatever the model says."""
+    assert await asked((NOWHERE, 0.8), (UNREADABLE, 0.1), (NOWHERE, 0.05)) == ({}, 0.1)
+
+
+async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
+    """The first answers are enough where one breaks no rule; where none does, one that is found later is taken."""
+    model = Model([(NOWHERE, 0.8), (RIGHT, 0.1)])
+    await proposed(model)
+    assert model.asked == [False]
+    model = Model([(NOWHERE, 0.8)], thorough=[(NOWHERE, 0.8), (UNREADABLE, 0.1), (RIGHT, 0.02)])
+    proposal = await proposed(model)
+    assert (proposal.plan.subtasks[0].params, proposal.confidence) == ({"place": "dock 3"}, 0.02)
+    assert model.asked == [False, True]
+
+
+@pytest.mark.parametrize(
+    "senseless",
+    [
+        pytest.param([*RIGHT, "|", *RIGHT[1:], "<", "1"], id="a way to where it already is"),
+        pytest.param([*RIGHT, "|", "goto", "w0", "w0", "place:", "w4", "w4"], id="two ways at once"),
+        pytest.param(["manipulation", *RIGHT[1:]], id="a domain of none of its skills"),
+    ],
+)
+async def test_what_cannot_be_meant_is_not_taken(senseless: list[str]) -> None:
+    """A valid plan that breaks a rule by which instructions are read gives way to the next likely one."""
+    proposal = await proposed(Model([(senseless, 0.6), (RIGHT, 0.3)]))
+    assert proposal.plan.domain == "navigation"
+    assert [each.params for each in proposal.plan.subtasks] == [{"place": "dock 3"}]
 
 
 async def test_a_refusal_is_no_plan() -> None:

@@ -1,0 +1,241 @@
+"""Whether a plan can be what an instruction means: the annotation rules of plans, as far as a program can tell.
+
+Everything that can be decided without understanding the sentence is decided here: names, types, ids, order, actuators
+used twice at once, ways to where a robot already is, things put down that were never picked up, names that the
+instruction does not contain. The corpus is held to it, since a wrong pair teaches a wrong habit; and of a model's
+answers the likeliest one that breaks no rule is taken. Unlike `validate` it says nothing of safety or of what can run.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+
+from msgspec import Struct
+
+from appliance.llm.validate import JOINT
+from appliance.model import Subtask
+from appliance.skills.catalogue import Catalogue, SkillManifest
+
+NUMBERS = {
+    word: str(number)
+    for number, word in enumerate(
+        (
+            *("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven"),
+            *("twelve", "thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen", "nineteen", "twenty"),
+        )
+    )
+}
+"""Number words, in figures."""
+_TENS = {
+    word: tens
+    for tens, word in enumerate(("twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety"), start=2)
+}
+_TOGETHER = re.compile(
+    r"\b(while|whilst|meanwhile|meantime|as (you|he|she|it|they|we)|as \w+ (is|goes|does|drives|flies)|same time|"
+    r"simultaneous\w*|parallel|during|at once|along the way|on (the|your) way|all the while|throughout)\b"
+)
+_HELD = re.compile(r"\b(hold|holding|held|holds|carrying|carries|you have|you've got|has got|in (its|your) gripper)\b")
+_FEEDS = {
+    "encode_clip": ("extract_frames",),
+    "classify_action": ("encode_clip",),
+    "correct_text": ("transcribe",),
+    "aggregate": ("train_local",),
+    "merge_maps": ("map_area", "explore", "detect", "find"),
+    "compare": ("photograph", "inspect", "scan_thermal", "measure", "count", "read", "map_area", "explore"),
+}
+"""Consumers that come after a producer whenever the plan has one."""
+_ANY = re.compile(r"any\d*|all")
+
+
+class Meaning(Struct, frozen=True, kw_only=True):
+    """An instruction, and the plan that it is taken to mean."""
+
+    instruction: str
+    robots: tuple[str, ...] = ()
+    """The roster; empty when unknown."""
+    domain: str
+    subtasks: tuple[Subtask, ...]
+
+
+def problems(meaning: Meaning, catalogue: Catalogue) -> tuple[str, ...]:
+    """Return what speaks against a plan for an instruction, each as a sentence; nothing where it may be meant."""
+    found: list[str] = []
+    if meaning.domain not in {
+        catalogue.skills[each.skill].domain for each in meaning.subtasks if each.skill in catalogue.skills
+    }:
+        found.append(f"domain {meaning.domain} is not that of any of its subtasks")
+    words = stems(meaning.instruction)
+    for index, subtask in enumerate(meaning.subtasks):
+        where = f"{subtask.id} ({subtask.skill})"
+        if subtask.id != f"s{index + 1}":
+            found.append(f"{where}: ids are s1, s2, ... in the order of the lines")
+        manifest = catalogue.skills.get(subtask.skill)
+        if manifest is None:
+            found.append(f"{where}: there is no such skill")
+            continue
+        found += [f"{where}: {text}" for text in _params(subtask, manifest)]
+        found += [f"{where}: {text}" for text in _robot(subtask, manifest, meaning, words)]
+        found += [f"{where}: {text}" for text in _words(subtask, words)]
+    return (*found, *(_order(meaning, catalogue) if not found else ()))
+
+
+def stems(text: str) -> frozenset[str]:
+    """Return the words of a text without endings of the plural, number words also in figures."""
+    words = re.findall(r"[a-z0-9]+", re.sub(r"['’]s\b", "", text.lower()))
+    found = {stem(word) for word in words} | {NUMBERS[word] for word in words if word in NUMBERS}
+    for first, second in zip(words, (*words, "")[1:], strict=True):
+        found.add(stem(first + second))
+        if first in _TENS:
+            found.add(str(_TENS[first] * 10 + (int(NUMBERS.get(second, "0")) % 10)))
+        if first in NUMBERS and second in NUMBERS:  # room two one four
+            found.add(NUMBERS[first] + NUMBERS[second])
+    for first, last in re.findall(r"\b(\d{1,4})\s*(?:to|through|thru|till|-|–)\s*(\d{1,4})\b", text.lower()):
+        found |= {str(number) for number in range(int(first), min(int(last), int(first) + 50))}
+    found |= {part for word in words for part in re.findall(r"[a-z]+|[0-9]+", word)}
+    return frozenset(found)
+
+
+def stem(word: str) -> str:
+    """Return a word without an ending of the plural, to compare with others so treated."""
+    if word.endswith("ies") and len(word) > 4:
+        return word[:-3] + "y"
+    if word.endswith("ves") and len(word) > 4:
+        return word[:-3] + "f"
+    if word.endswith(("ches", "shes", "xes", "sses", "oes")):
+        return word[:-2]
+    return word[:-1] if word.endswith("s") and len(word) > 3 and not word.endswith("ss") else word
+
+
+def before(subtasks: Sequence[Subtask]) -> dict[str, frozenset[str]]:
+    """Return for each subtask all that come before it, directly or not; lines must stand in a possible order."""
+    reach: dict[str, frozenset[str]] = {}
+    for subtask in subtasks:
+        reach[subtask.id] = frozenset(subtask.after).union(*(reach[other] for other in subtask.after))
+    return reach
+
+
+def _params(subtask: Subtask, manifest: SkillManifest) -> Iterable[str]:
+    for name, param in manifest.params.items():
+        if param.required and name not in subtask.params:
+            yield f"parameter {name} is missing"
+    for name, value in subtask.params.items():
+        kind = manifest.params[name].type if name in manifest.params else None
+        if kind is None:
+            yield f"there is no parameter {name}"
+        elif kind in ("number", "integer"):
+            whole = isinstance(value, int) or (kind == "number" and isinstance(value, float))
+            if not whole or isinstance(value, bool) or value <= 0:
+                yield f"{name} must be a {kind} above 0"
+        elif kind == "array":
+            if not isinstance(value, list) or not value or not all(_clean(item) for item in value):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+                yield f"{name} must be a list of lower-case texts"
+        elif not _clean(value):
+            yield f"{name} must be lower-case text without an article in front, blanks or a full stop at its ends"
+        elif name not in ("text", "question", "event") and value.startswith(
+            ("the ", "a ", "an ", "my ", "our ", "your ")
+        ):
+            yield f"{name} must be without article or possessive"
+
+
+def _clean(value: object) -> bool:
+    return isinstance(value, str) and value != "" and value == value.strip(" .\"'").lower()
+
+
+def _robot(subtask: Subtask, manifest: SkillManifest, meaning: Meaning, words: frozenset[str]) -> Iterable[str]:
+    listed: list[str] = subtask.params.get("robots") or []
+    if (subtask.robot is None) != (manifest.runs == "compute"):
+        yield "a skill that runs as compute has robot -, any other has a robot"
+    if subtask.skill in JOINT and subtask.robot is not None and listed[:1] != [subtask.robot]:
+        yield "a joint skill's robot is the first of its robots"
+    if len(set(listed)) != len(listed):
+        yield "a robot is listed twice"
+    for robot in {*listed, *([subtask.robot] if subtask.robot else [])}:
+        if _ANY.fullmatch(robot):
+            if robot == "all" and meaning.robots:
+                yield "the roster is known: one copy for each robot in place of all"
+        elif meaning.robots and robot not in meaning.robots:
+            yield f"robot {robot} is not in the roster"
+        elif not meaning.robots and (lost := [part for part in re.split(r"[_.-]", robot) if stem(part) not in words]):
+            yield f"robot {robot}: the instruction does not say {', '.join(lost)}"
+
+
+def _words(subtask: Subtask, words: frozenset[str]) -> Iterable[str]:
+    params: dict[str, str | list[str] | float] = subtask.params
+    for name, value in params.items():
+        if name == "robots" or value == "operator":
+            continue
+        texts = value if isinstance(value, list) else [value] if isinstance(value, str) else []
+        said = {word for text in texts for word in re.findall(r"[a-z0-9]+", re.sub(r"['’]s\b", "", text))}
+        if lost := sorted(word for word in said if stem(word) not in words and word not in words):
+            yield f"{name}: the instruction does not say {', '.join(lost)}"
+
+
+def _order(meaning: Meaning, catalogue: Catalogue) -> Iterable[str]:
+    known: set[str] = set()
+    for subtask in meaning.subtasks:
+        if unknown := [other for other in subtask.after if other not in known]:
+            yield f"{subtask.id}: {', '.join(unknown)} must stand before it"
+            return
+        if list(subtask.after) != sorted(set(subtask.after), key=lambda each: int(each[1:])):
+            yield f"{subtask.id}: predecessors must stand once each, in order"
+        known.add(subtask.id)
+    reach = before(meaning.subtasks)
+    for subtask in meaning.subtasks:
+        for other in subtask.after:
+            if any(other in reach[third] for third in subtask.after):
+                yield f"{subtask.id}: < {other} follows from its other predecessors"
+        yield from _feeds(subtask, meaning, reach)
+    together = bool(_TOGETHER.search(meaning.instruction.lower()))
+    for index, one in enumerate(meaning.subtasks):
+        for two in meaning.subtasks[index + 1 :]:
+            if one.id in reach[two.id] or not _crew(one) & _crew(two):
+                continue
+            shared = set(catalogue.skills[one.skill].uses) & set(catalogue.skills[two.skill].uses)
+            if shared:
+                yield f"{one.id} and {two.id} use the {' and '.join(sorted(shared))} of one robot at once"
+            elif not together:
+                yield f"{one.id} and {two.id} run together on one robot, which the instruction does not say"
+    yield from _moves(meaning)
+
+
+def _feeds(subtask: Subtask, meaning: Meaning, reach: dict[str, frozenset[str]]) -> Iterable[str]:
+    producers = {each.id for each in meaning.subtasks if each.skill in _FEEDS.get(subtask.skill, ())}
+    aside = {each for each in producers if subtask.id not in reach[each]}
+    if aside and not producers & reach[subtask.id]:
+        yield f"{subtask.id} ({subtask.skill}): it must come after what it uses, one of {', '.join(sorted(aside))}"
+
+
+def _moves(meaning: Meaning) -> Iterable[str]:
+    """A goto to where the robot already is, and a thing put down that was never picked up."""
+    where: dict[str, object] = {}
+    held: set[tuple[str, object]] = set()
+    holding = bool(_HELD.search(meaning.instruction.lower()))
+    for subtask in meaning.subtasks:
+        robot = subtask.robot or ""
+        if subtask.skill == "goto":
+            if where.get(robot) == subtask.params["place"]:
+                yield f"{subtask.id}: {robot} was sent there before, and nowhere since"
+            where[robot] = subtask.params["place"]
+        elif _travels(subtask.skill):
+            where.pop(robot, None)
+        elif subtask.skill == "pick":
+            held.add((robot, subtask.params["object"]))
+        elif subtask.skill == "handover":
+            held.add((str(subtask.params["to"]), subtask.params["object"]))
+        elif subtask.skill == "place" and (robot, subtask.params["object"]) not in held and not holding:
+            yield f"{subtask.id}: {robot} puts down what it has not picked up"
+
+
+def _travels(skill: str) -> bool:
+    """Whether a skill other than goto takes a robot elsewhere."""
+    return skill in {
+        "follow_path", "patrol", "explore", "map_area", "return_home", "dock", "follow", "guide", "rendezvous",
+        "lift_together",
+    }  # fmt: skip
+
+
+def _crew(subtask: Subtask) -> set[str]:
+    return (
+        {*(subtask.params.get("robots") or ()), *((subtask.robot,) if subtask.robot else ())}
+        if subtask.robot
+        else set()
+    )
