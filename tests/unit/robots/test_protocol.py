@@ -15,7 +15,8 @@ from appliance.robots.verbs import RobotFailure
 
 pytestmark = pytest.mark.anyio
 
-PATIENCE = Patience(timeout_s=0.05, tries=4)
+PATIENCE = Patience(timeout_s=0.25, tries=4)
+"""A loaded machine may stop this process for a tenth of a second: that must not look like silence."""
 BEAT = {"type": 2, "autopilot": 3, "base_mode": 0, "custom_mode": 4, "system_status": 3, "mavlink_version": 3}
 Script = Callable[[Message], list[Message]]
 
