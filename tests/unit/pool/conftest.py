@@ -334,7 +334,7 @@ class FakeEngine:
         """Do nothing."""
 
 
-async def until(true: Callable[[], bool], what: str, *, within_s: float = 20.0) -> None:
+async def until(true: Callable[[], bool], what: str, *, within_s: float = 60.0) -> None:
     """Wait until something holds; fails with what it was."""
     try:
         async with asyncio.timeout(within_s):

@@ -54,7 +54,7 @@ async def test_floor_is_kept(bench: Any) -> None:
 
 async def test_reservations(bench: Any) -> None:
     """Two selections never get the same container, and one that is not used is free again after its lease."""
-    pool = await bench.pool(floor={"base": 2}, capacity=2, lease_s=0.2)
+    pool = await bench.pool(floor={"base": 2}, capacity=2, lease_s=2.0)
     await bench.ready(pool, 2)
     need = Need(image="base", cpu=0.1, memory_mb=64)
     decisions = [await pool.select(need, allow_remote=False) for _ in range(3)]
@@ -104,7 +104,7 @@ async def test_one_that_comes_free_is_taken_not_given_up(bench: Any) -> None:
 
 async def test_queue_is_bounded(bench: Any, tmp_path: Path) -> None:
     """When everything is busy and the queue full a run is refused with the reason; one that waits too long fails."""
-    pool = await bench.pool(capacity=1, queue=1, queue_wait_s=0.3)
+    pool = await bench.pool(capacity=1, queue=1, queue_wait_s=3.0)
     sleeper = asyncio.create_task(bench.run(pool, bench.request(1, do="sleep", pid=str(tmp_path / "pid"))))
     await bench.until((tmp_path / "pid").exists, "the first run")
     waiting = asyncio.create_task(bench.run(pool, bench.request(2)))
@@ -265,7 +265,7 @@ async def test_a_hung_runner_is_replaced(bench: Any) -> None:
     """A runner that answers no ping is replaced."""
     import signal  # noqa: PLC0415
 
-    pool = await bench.pool(floor={"base": 1}, probe_timeout_s=0.2)
+    pool = await bench.pool(floor={"base": 1}, probe_timeout_s=2.0)
     await bench.ready(pool, 1)
     hung = pool.containers()[0].id
     bench.engine.processes["engine-1"].send_signal(signal.SIGSTOP)

@@ -88,9 +88,9 @@ def test_age_is_counted_on_from_when_a_record_was_heard() -> None:
 
 async def test_a_task_whose_deadline_passes_ends_with_that_reason(bench: Any) -> None:
     """Its run is cancelled, its record says how far it was, and nothing is repeated."""
-    await bench.start(replace(bench.plane.accepted(), deadline_s=0.2))
+    await bench.start(replace(bench.plane.accepted(), deadline_s=2.0))
     _, request = await bench.ordered()
-    assert 0 < request.due_s <= 0.2
+    assert 0 < request.due_s <= 2.0
     bench.tell(request, RunEventKind.STARTED)
     ended = await bench.end()
     assert ended.state is TaskState.FAILED

@@ -51,7 +51,7 @@ async def test_a_robot_that_stays_busy_is_an_error_in_time(calls: Calls, plane: 
     """The wait ends with the command's own deadline."""
     plane.session.replies = [encode(RobotReply(id="t-1/s1/1", failure=Failure(code="busy", message="arm in use")))]
     with pytest.raises(RobotError, match="arm in use"):
-        await calls(ask("command", verb="goto", timeout_s=0.05))
+        await calls(ask("command", verb="goto", timeout_s=0.5))
 
 
 async def test_an_order_is_held_to_its_limits_before_it_is_sent(plane: Any, folder: Path) -> None:
@@ -207,7 +207,7 @@ async def test_a_robot_that_stays_stopped_is_an_error_in_time(hindered: tuple[Ca
     calls, reasons = hindered
     reasons.append("stopped by ann")
     with pytest.raises(RobotError, match="r1 is stopped by ann"):
-        await calls(ask("command", verb="goto", timeout_s=0.05))
+        await calls(ask("command", verb="goto", timeout_s=0.5))
     assert not plane.session.queries
 
 
