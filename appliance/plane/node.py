@@ -11,7 +11,7 @@ from pathlib import Path
 import structlog
 from msgspec import Struct
 
-from appliance.errors import ConfigError, SwiftbotError, UnreachableError
+from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError
 from appliance.plane.bounded import BoundedMembership
 from appliance.plane.browsing import Browsing
 from appliance.plane.dht import Dht
@@ -71,7 +71,11 @@ class Plane:
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
         self._outlived = Outlived(
-            self._pulse, lease_s=config.lease_ms / 1e3, members=self._membership, renew=session.renew_links
+            self._pulse,
+            lease_s=config.lease_ms / 1e3,
+            members=self._membership,
+            answers=self._answers,
+            renew=session.renew_links,
         )
         self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self._forgetting = Forgetting(self._voting, gateway=gateway, store=store, kept_hours=config.tombstone_hours)
@@ -216,6 +220,15 @@ class Plane:
             return_exceptions=True,
         )
         return any(isinstance(answer, Member) and answer.here for answer in answers)
+
+    async def _answers(self, name: str, timeout_s: float) -> bool:
+        """Whether a member answers a question in time, whatever it says."""
+        ask = MemberAsk(gateway=self.gateway)
+        try:
+            await self.rpc.call(name, "member", ask, Member, timeout_s=timeout_s)
+        except SwiftbotError as error:
+            return not isinstance(error, UnreachableError | DeadlineError)
+        return True
 
     async def _on_member(self, ask: MemberAsk) -> Member:
         return Member(here=check_name(ask.gateway, "gateway") in self._membership.members)

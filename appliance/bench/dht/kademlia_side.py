@@ -1,11 +1,15 @@
 """The other side of the comparison, nodes of the `kademlia` package; runs under the Python that has it.
 
-    python kademlia_side.py NODES KSIZE PORT [FIRST]
+    python kademlia_side.py NODES KSIZE PORT FIRST [FOLDER]
 
 All nodes run in this process, on one event loop, as the gateways beside them do; where each gateway has a process of
 its own NODES is 1, and FIRST the port of the first node of all. Reads commands {"op": "put" | "get", "keys": [...],
 "value": "..."} and prints JSON lines: {"event": "ready", "version": ...}, then for each command {"event": op, "ms":
-[...], "failed": n}; "bootstrap" has it meet the first node once more. Ends with its input.
+[...], "failed": n, "cpu_ms": processor time of the process}; "bootstrap" has it meet the first node once more. Ends
+with its input.
+
+With a FOLDER each node has what it stores on the disk before it answers, as gateways do: the package takes any storage,
+and this one writes to SQLite first. The package's own keeps everything in memory alone.
 """
 
 import asyncio
@@ -13,8 +17,10 @@ import importlib
 import importlib.metadata
 import json
 import random
+import sqlite3
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 
@@ -24,10 +30,27 @@ def tell(event: str, **fields: Any) -> None:
     sys.stdout.flush()
 
 
-async def main(nodes: int, ksize: int, port: int, first: int) -> None:
+def durable(path: Path) -> Any:
+    """The package's storage, with each value synced to a file of the same settings as a gateway's (WAL, FULL)."""
+    memory: Any = importlib.import_module("kademlia.storage").ForgetfulStorage
+    db = sqlite3.connect(path, isolation_level=None)
+    db.execute("PRAGMA journal_mode = WAL")
+    db.execute("PRAGMA synchronous = FULL")
+    db.execute("CREATE TABLE stored (key BLOB PRIMARY KEY, value TEXT)")
+
+    class Durable(memory):
+        def __setitem__(self, key: bytes, value: str) -> None:
+            db.execute("INSERT OR REPLACE INTO stored VALUES (?, ?)", (key, value))
+            super().__setitem__(key, value)
+
+    return Durable()
+
+
+async def main(nodes: int, ksize: int, port: int, first: int, folder: Path | None) -> None:
     """Start the nodes, obey, stop them."""
     network: Any = importlib.import_module("kademlia.network")
-    servers: list[Any] = [network.Server(ksize=ksize) for _ in range(nodes)]
+    stores = [durable(folder / f"{port + number}.sqlite") if folder else None for number in range(nodes)]
+    servers: list[Any] = [network.Server(ksize=ksize, storage=store) for store in stores]
     for number, server in enumerate(servers):
         await server.listen(port + number, interface="127.0.0.1")
 
@@ -44,7 +67,7 @@ async def main(nodes: int, ksize: int, port: int, first: int) -> None:
         if command["op"] == "bootstrap":
             await bootstrap()
         times: list[float] = []
-        failed = 0
+        failed, cpu = 0, time.process_time()
         for key in command["keys"]:
             server = random.choice(servers)  # noqa: S311 - spreads load
             began = time.perf_counter()
@@ -54,11 +77,11 @@ async def main(nodes: int, ksize: int, port: int, first: int) -> None:
                 done = await server.get(key) is not None
             times.append((time.perf_counter() - began) * 1e3)
             failed += not done
-        tell(command["op"], ms=times, failed=failed)
+        tell(command["op"], ms=times, failed=failed, cpu_ms=(time.process_time() - cpu) * 1e3)
     for server in servers:
         server.stop()
 
 
 if __name__ == "__main__":
-    count, copies, at = (int(each) for each in sys.argv[1:4])
-    asyncio.run(main(count, copies, at, int(sys.argv[4]) if len(sys.argv) > 4 else at))
+    count, copies, at, begin = (int(each) for each in sys.argv[1:5])
+    asyncio.run(main(count, copies, at, begin, Path(sys.argv[5]) if len(sys.argv) > 5 else None))

@@ -4,7 +4,9 @@ Both sides have real sockets, store the same keys and values, and are asked thro
 process a side has one event loop for all its nodes; with a process for each, as gateways run, every message wakes
 another process. They do not promise the same: a put here is a compare-and-set ordered by the key's owner
 and synced to the disks of three gateways before it is acknowledged, where kademlia's last writer wins in memory and
-nothing is ever on a disk; `put_unsynced` shows what syncing costs.
+nothing is ever on a disk. So that the same work is compared too, `put_unsynced` is ours without syncing, and
+`kademlia_durable` the package with a storage that has a value on the disk before it answers. `zenoh_alone` is a
+question and its answer between as many sessions of one process, with no code of ours (`bare`).
 """
 
 import asyncio
@@ -63,8 +65,10 @@ async def run(
     """Measure `count` puts and gets on both sides.
 
     Returns:
-        `swiftbot` and `kademlia`: `put`, `get` (and `put_unsynced`), each count, p50, p90, p99 and max in ms; the
-        ratios of the medians. `kademlia` is `missing`, with how to install it, where it is not there.
+        `swiftbot`, `kademlia`, `kademlia_durable` and, in one process, `zenoh_alone`: what each did of `put`, `get` and
+        `put_unsynced`, each count, p50, p90, p99 and max in ms; `cpu_ms_each` (one process), processor time of an
+        operation, which other work on the machine changes less. The ratios of the medians and of p99. `kademlia` is
+        `missing`, with how to install it, where it is not there.
 
     Raises:
         SwiftbotError: a side could not be started, or a gateway has not what was put.
@@ -74,30 +78,42 @@ async def run(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="swiftbot-bench-")))
         progress(f"{nodes} gateways on loopback, {layout}")
         sides: dict[str, Side] = {"swiftbot": await _our_side(stack, nodes, folder, layout)}
+        ops: dict[str, tuple[str, ...]] = {"swiftbot": ("put", "get", "put_unsynced")}
         result: dict[str, Any] = {"nodes": nodes, "layout": layout, "value_bytes": len(_VALUE)}
+        if layout == "one process":
+            progress(f"{nodes} sessions of Zenoh alone")
+            sides["zenoh_alone"], ops["zenoh_alone"] = await _zenoh_alone(stack, nodes), ("get",)
         if python is None:
             progress(f"kademlia is not installed: {REMEDY}")
             result["kademlia"] = {"missing": "kademlia is not installed", "remedy": REMEDY}
         else:
-            progress(f"{nodes} nodes of kademlia, {layout}")
-            sides["kademlia"] = await _kademlia(stack, python, nodes, layout)
-        times: dict[str, dict[str, list[float]]] = {name: {"put": [], "get": []} for name in sides}
-        times["swiftbot"]["put_unsynced"] = []
+            progress(f"{nodes} nodes of kademlia, twice, {layout}")
+            sides["kademlia"], ops["kademlia"] = await _kademlia(stack, python, nodes, layout), ("put", "get")
+            durable = folder / "kademlia"
+            durable.mkdir()
+            sides["kademlia_durable"] = await _kademlia(stack, python, nodes, layout, durable=durable)
+            ops["kademlia_durable"] = ("put",)
+        times: dict[str, dict[str, list[float]]] = {name: {what: [] for what in ops[name]} for name in sides}
         for block in range(-(-count // _BLOCK)):
             progress(f"{min(count, (block + 1) * _BLOCK)} of {count}")
-            keys = [f"bench/{block}-{number}" for number in range(_BLOCK)]
-            for what in ("put", "get"):
+            for what in ("put", "get", "put_unsynced"):
+                suffix = "-u" if what == "put_unsynced" else ""
+                keys = [f"bench/{block}-{number}{suffix}" for number in range(_BLOCK)]
                 for name, side in sides.items():
-                    times[name][what] += await side.do(what, keys)
-            unsynced = [f"{key}-u" for key in keys]
-            times["swiftbot"]["put_unsynced"] += await sides["swiftbot"].do("put_unsynced", unsynced)
+                    if what in ops[name]:
+                        times[name][what] += await side.do(what, keys)
     figures = {name: {what: summary(found) for what, found in kinds.items()} for name, kinds in times.items()}
     for name, side in sides.items():
         result[name] = figures[name] | side.about()
     if "kademlia" in sides:
         result["kademlia_over_swiftbot"] = {
-            f"{what}_{part}": ratio(figures["kademlia"][what][part], figures["swiftbot"][what][part])
-            for what in ("put", "get")
+            f"{name}_{part}": ratio(theirs[part], ours[part])
+            for name, theirs, ours in (
+                ("put", figures["kademlia"]["put"], figures["swiftbot"]["put"]),
+                ("get", figures["kademlia"]["get"], figures["swiftbot"]["get"]),
+                ("put_both_unsynced", figures["kademlia"]["put"], figures["swiftbot"]["put_unsynced"]),
+                ("put_both_synced", figures["kademlia_durable"]["put"], figures["swiftbot"]["put"]),
+            )
             for part in ("p50", "p99")
         }
     return result
@@ -133,11 +149,29 @@ async def _our_side(stack: AsyncExitStack, nodes: int, folder: Path, layout: Lay
     return _Processes(processes, copies=PlaneConfig().replicas)
 
 
+class _Cpu:
+    """Processor time of a side that is one process."""
+
+    def __init__(self) -> None:
+        self._spent: dict[str, list[float]] = {}
+
+    def add(self, what: str, cpu_ms: float, times: int) -> None:
+        """So many operations took so much."""
+        spent = self._spent.setdefault(what, [0.0, 0.0])
+        spent[0] += cpu_ms
+        spent[1] += times
+
+    def each(self) -> dict[str, float]:
+        """Milliseconds of an operation, by kind."""
+        return {what: round(cpu_ms / max(1.0, times), 3) for what, (cpu_ms, times) in self._spent.items()}
+
+
 class _Ours:
     """Our side in this process."""
 
     def __init__(self, planes: list[Plane]) -> None:
         self._planes = planes
+        self._cpu = _Cpu()
 
     async def do(self, what: str, keys: list[str]) -> list[float]:
         """As `Side.do`."""
@@ -148,11 +182,12 @@ class _Ours:
             if told["failed"]:
                 raise SwiftbotError(f"{key} was put and is not there")
             times += told["ms"]
+            self._cpu.add(what, told["cpu_ms"], 1)
         return times
 
     def about(self) -> dict[str, Any]:
         """As `Side.about`."""
-        return {"copies": self._planes[0].config.replicas}
+        return {"copies": self._planes[0].config.replicas, "cpu_ms_each": self._cpu.each()}
 
 
 @asynccontextmanager
@@ -186,6 +221,7 @@ class _Processes:
         self._processes = processes
         self._about = about
         self._failed = 0
+        self._cpu = _Cpu()
 
     async def do(self, what: str, keys: list[str]) -> list[float]:
         """As `Side.do`; what takes the time is measured within the process."""
@@ -207,14 +243,26 @@ class _Processes:
         process.stdin.write(json.dumps({"op": what, "keys": keys, "value": _VALUE}).encode() + b"\n")
         told = await line_of(process, what)
         self._failed += int(told["failed"])
+        self._cpu.add(what, float(told["cpu_ms"]), len(keys))
         return [float(each) for each in told["ms"]]
 
     def about(self) -> dict[str, Any]:
         """As `Side.about`."""
-        return {**self._about, "failed": self._failed}
+        # Of several, the others work for the one that is asked.
+        cpu = {"cpu_ms_each": self._cpu.each()} if len(self._processes) == 1 else {}
+        return {**self._about, "failed": self._failed, **cpu}
 
 
-async def _kademlia(stack: AsyncExitStack, python: Path, nodes: int, layout: Layout) -> Side:
+async def _zenoh_alone(stack: AsyncExitStack, nodes: int) -> Side:
+    command = (sys.executable, "-m", "appliance.bench.dht.bare", str(nodes))
+    process = await stack.enter_async_context(_process(*command))
+    await line_of(process, "ready")
+    return _Processes([process])
+
+
+async def _kademlia(
+    stack: AsyncExitStack, python: Path, nodes: int, layout: Layout, *, durable: Path | None = None
+) -> Side:
     port = random.randrange(_FIRST_PORT, _LAST_PORT)  # noqa: S311 - a range of UDP ports that is likely free
     each = [(nodes, port)] if layout == "one process" else [(1, port + number) for number in range(nodes)]
     processes: list[asyncio.subprocess.Process] = []
@@ -222,6 +270,7 @@ async def _kademlia(stack: AsyncExitStack, python: Path, nodes: int, layout: Lay
     for count, at in each:
         # -P: this folder is no place to import from.
         command = (str(python), "-P", str(_SIDE), str(count), str(KSIZE), str(at), str(port))
+        command += () if durable is None else (str(durable),)
         process = await stack.enter_async_context(_process(*command, plain=True))
         processes.append(process)
         version = str((await line_of(process, "ready"))["version"])

@@ -2,7 +2,8 @@
 
 Reads commands {"op": "put" | "put_unsynced" | "get", "keys": [...], "value": "..."} and prints JSON lines as the other
 side does (`kademlia_side`): {"event": "ready"} once as many members as it was told of are known and its shard is
-reconciled with theirs, then for each command {"event": op, "ms": [...], "failed": n}; ends with its input.
+reconciled with theirs, then for each command {"event": op, "ms": [...], "failed": n, "cpu_ms": ...}. Ends with its
+input.
 """
 
 import asyncio
@@ -36,10 +37,10 @@ class NodeOptions(Struct, frozen=True, kw_only=True):
 
 
 async def do(dht: Dht, command: dict[str, Any]) -> dict[str, Any]:
-    """Put or get keys one after the other, as a command says; returns how long each took, ms, and how many failed."""
+    """Put or get keys one after the other, as a command says; returns how long each took and how many failed."""
     op, value = command["op"], str(command["value"]).encode()
     times: list[float] = []
-    failed = 0
+    failed, cpu = 0, time.process_time()
     for key in command["keys"]:
         began = time.perf_counter()
         if op == "get":
@@ -48,7 +49,7 @@ async def do(dht: Dht, command: dict[str, Any]) -> dict[str, Any]:
             found = bool(await dht.write(key, value, expected=None, durable=op == "put"))
         times.append((time.perf_counter() - began) * 1e3)
         failed += not found
-    return {"event": op, "ms": times, "failed": failed}
+    return {"event": op, "ms": times, "failed": failed, "cpu_ms": (time.process_time() - cpu) * 1e3}
 
 
 async def serve(options: NodeOptions) -> None:
@@ -60,14 +61,15 @@ async def serve(options: NodeOptions) -> None:
     try:
         while len(plane.members()) < options.members or not plane.dht.reconciled():  # noqa: ASYNC110 - no single event says so
             await asyncio.sleep(_LOOK_S)
-        _tell({"event": "ready"})
+        tell({"event": "ready"})
         while line := await reader.readline():
-            _tell(await do(plane.dht, json.loads(line)))
+            tell(await do(plane.dht, json.loads(line)))
     finally:
         await plane.close()
 
 
-def _tell(what: dict[str, Any]) -> None:
+def tell(what: dict[str, Any]) -> None:
+    """Print a line."""
     sys.stdout.write(json.dumps(what) + "\n")
     sys.stdout.flush()
 

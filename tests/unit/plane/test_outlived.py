@@ -9,7 +9,7 @@ import pytest
 from appliance.plane.comparing import SEE_S
 from appliance.plane.keys import Keys
 from appliance.plane.membership import Membership
-from appliance.plane.outlived import TRIES, Outlived
+from appliance.plane.outlived import REST_S, Outlived
 from appliance.plane.pulse import Pulse, Standstill
 from appliance.plane.reconcile import LOSS_ASK_S
 
@@ -24,6 +24,8 @@ class Bench:
         self.on_stalled: list[Callable[[], None]] = []
         self.last_standstill = Standstill(0.0, 0.0)
         self.tokens = dict(tokens)
+        self.answering: set[str] = set()
+        self.asked: list[str] = []
         self.renewed: list[str] = []
         self.pauses: list[float] = []
         self.after: list[Callable[[], None]] = []
@@ -33,6 +35,7 @@ class Bench:
             cast("Pulse", self),
             lease_s=LEASE_S,
             members=self,
+            answers=self.answers,
             renew=self.renewed.append,
             now=lambda: self.now,
             pause=self.pause,
@@ -41,6 +44,17 @@ class Bench:
     def seen_since(self, moment: float) -> frozenset[str]:
         """Whose token has been there since then."""
         return frozenset(name for name, at in self.tokens.items() if at <= moment)
+
+    @property
+    def members(self) -> frozenset[str]:
+        """Who is there."""
+        return frozenset({"gw-1", *self.tokens})
+
+    async def answers(self, name: str, timeout_s: float) -> bool:
+        """Whether that one answers."""
+        assert timeout_s > 0
+        self.asked.append(name)
+        return name in self.answering
 
     async def pause(self, seconds: float) -> None:
         """Let what the test wants happen; the look is over when nothing more is to."""
@@ -74,31 +88,71 @@ class FakeSession:
         self.watching[0](f"{self.keys.alive(name)}{number}", alive)
 
 
-async def test_links_of_a_member_that_was_never_lost_are_made_anew() -> None:
-    """The others went and came again; of the one whose token stayed nothing that is known can be right."""
+async def test_links_are_made_anew_for_one_that_was_never_lost_and_is_silent() -> None:
+    """The other went and came again; of one whose token stayed, and that says nothing, nothing known can be right."""
     bench = Bench(("gw-2", 5.0), ("gw-3", 5.0))
-    bench.after = [lambda: bench.tokens.update({"gw-2": 12.0}), lambda: bench.tokens.update({"gw-3": 13.0})]
+    bench.after = [lambda: bench.tokens.update({"gw-2": 12.0})]
     await bench.stand_still(10.0, 1.1)
-    assert len(bench.renewed) == 1
-    assert bench.pauses == [LEASE_S / 2] * 2
+    assert (bench.asked, len(bench.renewed), bench.pauses) == (["gw-3"], 1, [LEASE_S / 2])
 
 
-async def test_it_is_not_tried_for_ever() -> None:
-    """A token that goes on being there whatever is done is no reason to break links again and again."""
+async def test_in_a_fleet_of_two_silence_is_enough() -> None:
+    """There is nobody else who could have noticed."""
     bench = Bench(("gw-2", 5.0))
     await bench.stand_still(10.0, 1.1)
-    assert len(bench.renewed) == TRIES
+    assert len(bench.renewed) == 1
+    bench.answering = {"gw-2"}
+    await bench.stand_still(10.0 + 2 * REST_S, 1.1)
+    assert (bench.asked, len(bench.renewed)) == (["gw-2", "gw-2"], 1)
 
 
-async def test_nothing_is_broken_when_all_were_lost_or_nobody_can_have_noticed() -> None:
+async def test_all_that_stood_still_together_are_left_alone() -> None:
+    """On a machine that was suspended, or starves, nobody loses anybody: no link is broken, and nobody is asked."""
+    bench = Bench(("gw-2", 5.0), ("gw-3", 5.0))
+    await bench.stand_still(10.0, 60.0)
+    assert (bench.asked, bench.renewed) == ([], [])
+
+
+async def test_one_that_answers_or_has_gone_meanwhile_is_well() -> None:
+    """A busy machine's gateways are late, and are lost a moment later than others: that is no mix-up."""
+    bench = Bench(("gw-2", 11.2), ("gw-3", 5.0), ("gw-4", 5.0))
+    bench.answering = {"gw-3"}
+    asked = bench.answers
+
+    async def gone(name: str, timeout_s: float) -> bool:
+        bench.tokens.pop("gw-4", None)
+        return await asked(name, timeout_s)
+
+    bench.outlived = Outlived(
+        cast("Pulse", bench), lease_s=LEASE_S, members=bench, answers=gone, renew=bench.renewed.append,
+        now=lambda: bench.now, pause=bench.pause,
+    )  # fmt: skip
+    bench.on_stalled = bench.on_stalled[1:]
+    await bench.stand_still(10.0, 1.1)
+    assert (bench.asked, bench.renewed) == (["gw-3", "gw-4"], [])
+
+
+async def test_it_is_not_done_again_at_once() -> None:
+    """Where a machine starves one standstill follows the other, and links made anew are more work."""
+    bench = Bench(("gw-2", 11.2), ("gw-3", 5.0))
+    await bench.stand_still(10.0, 1.1)
+    await bench.stand_still(12.0, 1.1)
+    assert len(bench.renewed) == 1
+    await bench.stand_still(12.0 + REST_S, 1.1)
+    assert len(bench.renewed) == 1, "gw-2 was not lost in that one: all stood still"
+    bench.tokens["gw-2"] = 99.0
+    await bench.stand_still(98.0, 1.1)
+    assert len(bench.renewed) == 2
+
+
+async def test_nothing_is_done_when_all_were_lost_or_nobody_can_have_noticed() -> None:
     """Members that came again, or that are gone, are well; a short standstill may have escaped the others."""
     bench = Bench(("gw-2", 5.0), ("gw-3", 5.0))
     await bench.stand_still(10.0, 0.8)
     assert bench.pauses == []
-    bench.after = [lambda: bench.tokens.update({"gw-2": 11.2}), bench.tokens.clear]
     bench.tokens = {"gw-2": 11.15}
     await bench.stand_still(10.0, 1.1)
-    assert bench.renewed == []
+    assert (bench.asked, bench.renewed) == ([], [])
     await bench.outlived.close()
 
 
