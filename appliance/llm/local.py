@@ -41,8 +41,9 @@ _NO_PLAN = {
     "unclear": "it does not say what to do, or with what",
     "language": "only English is understood",
 }
-_UNSOUND = 0.1
-"""How sure it can be of a plan that breaks a rule of plans; of held-out instructions none such was right."""
+_UNSOUND = 0.5
+"""How sure it can be of a plan that breaks a rule of plans: another tier is asked, or an operator. Of held-out
+instructions no such plan was right, but a program reads the rules more strictly than people do."""
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (

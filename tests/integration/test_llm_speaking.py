@@ -12,8 +12,9 @@ import pytest
 
 from appliance.errors import DeadlineError, PlanError, PrerequisiteError
 from appliance.llm import speaking
+from appliance.llm.language.coverage import covered
 from appliance.llm.language.guide import shapes
-from appliance.llm.language.words import MAX_WORDS
+from appliance.llm.language.words import MAX_WORDS, words_of
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.slot import Slot
@@ -90,12 +91,16 @@ async def test_the_same_again_is_the_same(tier: LocalTier) -> None:
 
 
 def test_the_likeliest_whole_answer_is_given(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is likeliest step by step is among the answers, each different; it is no surer than the one given."""
+    """What is likeliest step by step is among the answers, each different; it is no surer than the one given.
+
+    That is so where coverage counts nothing; where it does, the one given leaves no more unsaid than any surer one.
+    """
     speaker = Slot(folder).speaker
     assert speaker is not None
     for instruction in INSTRUCTIONS[:2]:
         question = Question(text=instruction, robots=("rover_1", "drone_1"), skills=shapes(CATALOGUE), deadline_s=60.0)
         monkeypatch.setattr(speaking, "TURNS", 0)
+        monkeypatch.setattr(speaking, "SAID", 0.0)
         step_by_step = speaker.answer(question)
         monkeypatch.setattr(speaking, "TURNS", 12)
         monkeypatch.setattr(speaking, "FAIR", 0.0)
@@ -108,6 +113,12 @@ def test_the_likeliest_whole_answer_is_given(folder: Path, monkeypatch: pytest.M
         assert step_by_step.symbols in answers
         assert sure == sorted(sure, reverse=True)
         assert said.confidence >= step_by_step.confidence
+        monkeypatch.setattr(speaking, "SAID", 1.0)
+        fuller = speaker.answer(question)
+        words = words_of(instruction, question.robots or ())
+        surer = [each.symbols for each in fuller.others if each.confidence > fuller.confidence]
+        assert {fuller.symbols, *(each.symbols for each in fuller.others)} == set(answers)
+        assert all(covered(fuller.symbols, words) >= covered(each, words) for each in surer)
 
 
 def test_a_generator_that_was_set_back_says_the_same(folder: Path) -> None:
