@@ -31,7 +31,10 @@ def run(ctx):
     state = ctx.resume or {"done": 0, "by": []}
     state["by"].append(ctx.attempt)
     pad = "x" * int(ctx.params.get("pad", 0))
-    while state["done"] < int(ctx.params["steps"]):
+    last = int(ctx.params["steps"])
+    if ctx.resume:
+        last = min(last, state["done"] + int(ctx.params.get("then", last)))
+    while state["done"] < last:
         time.sleep(float(ctx.params["step_s"]))
         state["done"] += 1
         ctx.progress(state["done"] / int(ctx.params["steps"]))
@@ -113,6 +116,11 @@ type = "number"
 required = true
 
 [params.pad]
+type = "integer"
+required = false
+
+[params.then]
+description = "Steps after it was moved: so one that would never end can be moved at leisure, and ends."
 type = "integer"
 required = false
 

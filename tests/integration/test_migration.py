@@ -40,7 +40,7 @@ async def swiftbot(state: local_fleet.FleetState, *arguments: str) -> tuple[int,
 async def test_an_operator_moves_a_run_with_its_checkpoint_and_its_volume(tmp_path: Path) -> None:
     """It goes on there from a fresh checkpoint, no step is lost or done twice, and the log replays to the same end."""
     async with fleet_of(tmp_path) as state, FleetClient(state.endpoint) as client:
-        await client.submit(counting("t-hand", steps=160))
+        await client.submit(counting("t-hand", steps=4000, then=200))
         before = await until_running(client, "t-hand")
         to = next(each for each in state.gateways if each != before.gateway)
         code, out, err = await swiftbot(state, "task", "migrate", "t-hand", "s1", "--to", to, "--json")

@@ -199,7 +199,7 @@ async def test_cancel_and_retry(ann: Operator, client: FleetClient) -> None:
 
 async def test_migrate_by_hand(ann: Operator, client: FleetClient) -> None:
     """A run is moved to the other gateway with its checkpoint, and ends there."""
-    await client.submit(counting("t-move", steps=200))
+    await client.submit(counting("t-move", steps=ENDLESS, then=20))
     record = await record_of(client, "t-move", running)
     source = record.of("s1").gateway
     (target,) = {"gw-1", "gw-2"} - {source}
