@@ -108,12 +108,12 @@ def blocked_leg(
     A box that holds the start is left out until the way has left it: a robot that stands in one must be able to
     drive out of it, and may not come back.
     """
-    around = {index for index, box in enumerate(boxes) if inside(box, *start)}
+    around: set[int] = {index for index, box in enumerate(boxes) if inside(box, *start)}
     here = start
     for leg, point in enumerate(points):
         for index, box in enumerate(boxes):
             if index not in around and crosses(box, here, point):
                 return leg, box
-        around = {index for index in around if inside(boxes[index], *point)}
+        around -= {index for index in around if not inside(boxes[index], *point)}
         here = point
     return None
