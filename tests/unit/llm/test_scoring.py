@@ -10,10 +10,12 @@ from typing import Any
 import msgspec
 import pytest
 
+from appliance.llm import corpus
+from appliance.llm.corpus.notation import parse
 from appliance.llm.language.codec import read
 from appliance.llm.language.words import words_of
 from appliance.llm.scoring import mean_figures, score
-from appliance.llm.train.corpus import corpus_examples
+from appliance.llm.train.examples import example_of
 from appliance.skills.catalogue import load_catalogue
 
 GOLD: dict[str, Any] = {
@@ -63,8 +65,13 @@ def test_it_is_the_shared_scorer_s_figures(shared: Path) -> None:
     """Of hand-written plans with things wrong at random every figure is the shared scorer's, those of no plan too."""
     theirs: Any = runpy.run_path(str(shared / "decomposition" / "score.py"))["score_case"]
     catalogue, rng = load_catalogue(), random.Random(5)  # noqa: S311 - what is wrong, not secrets
-    examples = [each for each in corpus_examples(catalogue) if each.symbols[0] != "none"]
-    for example in rng.sample(examples, 400):
+    files = sorted(Path(corpus.__file__).parent.glob("*.plan"))
+    pairs = [pair for file in files for pair in parse(file.read_text(), name=file.name).values()]
+    # Few of the thousands are made into examples: that takes milliseconds each.
+    examples = [example_of(pair, catalogue) for pair in rng.sample(pairs, 450)]
+    examples = [each for each in examples if each.symbols[0] != "none"]
+    assert len(examples) > 350
+    for example in examples:
         words = words_of(" ".join(example.words[: example.own]), example.words[example.own :])
         gold = json.loads(msgspec.json.encode(read(example.symbols, words, catalogue)))
         for _ in range(5):
