@@ -43,6 +43,10 @@ _OF_NUMBERS = frozenset(
     | {"and", "-", "half", "quarter", "quarters", "oh", "niner", "dozen", "point"}
 )
 _PHRASES: dict[str, list[str]] = tomllib.loads(Path(__file__).with_name("phrases.toml").read_text(encoding="utf-8"))
+_WHOEVER = frozenset(
+    {"robot", "robots", "drone", "drones", "bot", "bots", "unit", "units", "machine", "machines", "arm", "arms"}
+    | {"somebody", "someone", "anyone", "anybody", "whoever", "whichever", "everyone", "everybody", "another", "other"}
+)
 _LEADS = frozenset(
     {"then", "after", "afterwards", "next", "finally", "and", "once", "when", "meanwhile"}
     | {"while", "or", "but", "also", "later", "before", "first", "if"}
@@ -58,9 +62,11 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
         lexicon: nouns for other names.
         rng: of everything that is random.
     """
-    made = example
-    if others and rng.random() < 0.3:
-        made = joined(made, rng.choice(others), rng) or made
+    made = addressed(example, lexicon, rng) if rng.random() < 0.4 else example
+    for chance in (0.4, 0.15):
+        if others and rng.random() < chance:
+            other = rng.choice(others)
+            made = joined(made, addressed(other, lexicon, rng) if rng.random() < 0.6 else other, rng) or made
     if rng.random() < 0.8:
         made = renamed(made, lexicon, rng)
     for chance, change in _CHANGES:
@@ -125,6 +131,27 @@ def _movable(found: Sequence[Span], first: int, last: int) -> bool:
     )
 
 
+# --- called by name ------------------------------------------------------------------------------------------------
+
+
+def addressed(example: Example, lexicon: Lexicon, rng: random.Random) -> Example:
+    """Return an order to whomever as one to a robot that is called by its name first: all of it is that robot's."""
+    if example.symbols[0] == "none" or len(example.words) > example.own or _robots(example) != {"any"}:
+        return example
+    if _WHOEVER & set(example.words):
+        return example  # it speaks of a robot that is none in particular
+    name = lexicon.noun(ROBOT, rng)
+    if rng.random() < 0.25:
+        name = (rng.choice(_PHRASES["kinds"]), str(rng.randrange(1, 20)))
+    before, after = rng.choice(_PHRASES["calls"]).split("NAME")
+    opening = [*before.split(), *name, *after.split()]
+    first = len(before.split())
+    made = _inserted(example, 0, opening)
+    pointer = (f"w{first}", f"w{first + len(name) - 1}")
+    symbols = [word for each in made.symbols for word in (pointer if each == "any" else (each,))]
+    return replace(made, symbols=tuple(symbols))
+
+
 # --- two as one ----------------------------------------------------------------------------------------------------
 
 
@@ -145,6 +172,8 @@ def joined(one: Example, two: Example, rng: random.Random) -> Example | None:
         roll = rng.random()
         in_order = roll < 0.4
         link = rng.choice(_PHRASES["then"] if in_order else _PHRASES["meanwhile"] if roll < 0.7 else _PHRASES["beside"])
+        if in_order and len(_lasts(one.symbols)) > 1:
+            link = rng.choice(_PHRASES["joining"])
     elif anys == {"any"} and firsts in ({"any"}, set()) and seconds in ({"any"}, set()):
         link = rng.choice(_PHRASES["then"])
     elif len(firsts) == 1 and not anys & firsts and seconds == {"any"} and "robots:" not in one.symbols:

@@ -15,7 +15,7 @@ from appliance.llm.train.examples import Example, example_of, is_exact, substitu
 from appliance.llm.train.lexicon import Lexicon, syllables
 from appliance.llm.train.splits import names, shape, split
 from appliance.llm.train.tokens import Tokens
-from appliance.llm.train.vary import joined, numbered, renamed, rostered, unmarked, vary
+from appliance.llm.train.vary import addressed, joined, numbered, renamed, rostered, unmarked, vary
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
 
@@ -66,6 +66,40 @@ def test_other_names_are_the_same_everywhere(seed: int) -> None:
     assert [each.skill for each in made] == ["goto", "pick"]
     assert made[0].robot == made[1].robot
     assert made[1].after == ("s1",)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_whom_an_order_is_put_to_has_all_of_it(seed: int) -> None:
+    """Called by name first, one robot does what any would have done; an order to nobody in particular stays so."""
+    order = example(
+        "Go to bay 2 and pick the drill .", "manipulation goto any place: w2 w3 | pick any object: w6 w6 < 1"
+    )
+    made = addressed(order, LEXICON, chance(seed))
+    assert is_exact(made, CATALOGUE)
+    (robot,) = {each.robot for each in plan(made)}
+    assert robot not in (None, "any")
+    assert [each.params for each in plan(made)] == [each.params for each in plan(order)]
+    for other in (
+        FETCH,
+        example("A robot goes to bay 2 .", "navigation goto any place: w4 w5"),
+        example("Hm .", "none chatter"),
+    ):
+        assert addressed(other, LEXICON, chance(seed)) == other
+
+
+def test_what_follows_two_side_by_side_waits_for_both() -> None:
+    """A third instruction that is joined in order to two of different robots comes after the last subtask of each."""
+    for seed in range(400):
+        both = joined(FETCH, FILM, chance(seed))
+        assert both is not None
+        if "< 2" in " ".join(both.symbols):
+            continue  # one after the other
+        third = example("Lou , open the gate .", "manipulation open w0 w0 object: w4 w4")
+        all_three = joined(both, third, chance(seed + 1))
+        if all_three is not None and all_three.symbols[-3:-1] == ("<", "2"):
+            assert plan(all_three)[-1].after == ("s2", "s3")
+            return
+    raise AssertionError("never in order")
 
 
 def test_two_instructions_as_one() -> None:
