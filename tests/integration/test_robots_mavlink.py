@@ -431,7 +431,7 @@ async def test_a_vehicle_is_moved_by_hand_and_holds_by_itself(open_yard: Open) -
     for _ in range(3):
         moved = await yard.done("velocity", forward_mps=2.0, for_s=0.5)
     assert (moved["pose"]["x"], moved["pose"]["y"]) != (before["x"], before["y"])
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         last = (await yard.done("state"))["pose"]
         while (now := (await yard.done("state"))["pose"]) != last or math.dist(xy(now), xy(before)) < 0.5:
             last = now

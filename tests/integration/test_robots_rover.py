@@ -229,7 +229,7 @@ async def test_two_rovers_share_their_world(hall: Hall) -> None:
     async def picked() -> bool:
         return (await hall.tell("rover_2", "pick", object="red box")).failure is None
 
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not await picked():
             await asyncio.sleep(0.05)
 
@@ -350,7 +350,7 @@ async def test_tasks_of_robots_reach_the_gateway(hall: Hall) -> None:
     try:
 
         async def put_until_heard(payload: bytes, holds: Callable[[], bool]) -> None:
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(60):
                 while not holds():
                     client.put(client.keys.intake("rover_1"), payload)
                     await asyncio.sleep(0.05)
