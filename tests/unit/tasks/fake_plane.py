@@ -1,0 +1,241 @@
+# ruff: noqa: ARG002 - fakes take what the real ones take
+"""A gateway's plane in memory: session, records, RPC, store, registry and ring, under the test's control."""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+
+from appliance.errors import ConflictError, SwiftbotError, UnreachableError
+from appliance.model import Plan, TaskRecord, VersionVector
+from appliance.plane.dht import Record
+from appliance.plane.keys import Keys
+from appliance.plane.session import Message
+from tests.unit.tasks.sample_records import accepted, plan_of
+
+
+class FakeCloser:
+    """Counts nothing, closes nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class FakeSession:
+    """Delivers what is put to whoever subscribed, at once; keeps everything."""
+
+    def __init__(self) -> None:
+        self.keys = Keys("f")
+        self.puts: list[tuple[str, bytes]] = []
+        self.refused: dict[str, int] = {}
+        self.subscribers: list[tuple[str, Callable[[Message], None]]] = []
+        self.queries: list[bytes] = []
+        self.replies: list[bytes | SwiftbotError] = []
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Keep and deliver."""
+        self.puts.append((key, payload))
+        for expr, callback in list(self.subscribers):
+            if _matches(expr, key):
+                callback(Message(key, payload, deleted=False, at_ns=0, encoding=""))
+
+    def subscribe(self, expr: str, callback: Callable[[Message], None]) -> FakeCloser:
+        """Deliver raw messages."""
+        self.subscribers.append((expr, callback))
+        return FakeCloser()
+
+    def subscribe_typed(self, expr: str, kind: type[Any], callback: Callable[[str, Any], None]) -> FakeCloser:
+        """Deliver decoded messages."""
+        return self.subscribe(
+            expr, lambda message: callback(message.key, msgspec.json.decode(message.payload, type=kind))
+        )
+
+    def refuse(self, what: str, **_: object) -> None:
+        """Count."""
+        self.refused[what] = self.refused.get(what, 0) + 1
+
+    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        """Answer with the next prepared reply; the last one again and again."""
+        self.queries.append(payload)
+        await asyncio.sleep(0)
+        reply = self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
+        if isinstance(reply, SwiftbotError):
+            raise reply
+        return reply
+
+    def sent(self, key: str, kind: type[Any]) -> list[Any]:
+        """What was put on a key, decoded."""
+        return [msgspec.json.decode(payload, type=kind) for at, payload in self.puts if _matches(key, at)]
+
+
+def _matches(expr: str, key: str) -> bool:
+    ours, theirs = expr.split("/"), key.split("/")
+    return len(ours) == len(theirs) and all(a in ("*", b) for a, b in zip(ours, theirs, strict=True))
+
+
+class FakeDht:
+    """Records with compare-and-set; `break_next` makes the next writes fail."""
+
+    def __init__(self, gateway: str) -> None:
+        self.records: dict[str, Record] = {}
+        self.gateway = gateway
+        self.mine = True
+        self.break_next: list[Exception] = []
+        self.on_ring_change: list[Callable[[], None]] = []
+        self.resolver: object = None
+        self.writes = 0
+
+    async def read(self, key: str) -> Record | None:
+        """Return a record."""
+        await asyncio.sleep(0)
+        return self.records.get(key)
+
+    async def write(
+        self, key: str, value: bytes, *, expected: VersionVector | None, durable: bool = True
+    ) -> VersionVector:
+        """Compare and set."""
+        await asyncio.sleep(0)
+        if self.break_next:
+            raise self.break_next.pop(0)
+        current = self.records.get(key)
+        if (current.version if current else None) != expected:
+            raise ConflictError(f"{key} has moved on")
+        self.writes += 1
+        version = {self.gateway: self.writes}
+        self.records[key] = Record(key=key, value=value, version=version)
+        return version
+
+    async def remove(self, key: str, *, expected: VersionVector) -> None:
+        """Remove, if it has not moved on."""
+        await asyncio.sleep(0)
+        if self.records[key].version != expected:
+            raise ConflictError(f"{key} has moved on")
+        del self.records[key]
+
+    async def local(self, prefix: str) -> list[Record]:
+        """Return the shard."""
+        await asyncio.sleep(0)
+        return [record for key, record in self.records.items() if key.startswith(prefix)]
+
+    def owns(self, key: str) -> bool:
+        """Whether all keys are ours."""
+        return self.mine
+
+
+class FakeRpc:
+    """Answers calls by functions of the test, `on[verb]`; without one nobody answers."""
+
+    def __init__(self) -> None:
+        self.on: dict[str, Callable[[str, Any], Awaitable[Any]]] = {}
+        self.calls: list[tuple[str, str, Any]] = []
+        self.registered: dict[str, Callable[[Any], Awaitable[Any]]] = {}
+
+    def register(self, verb: str, request: type[Any], handler: Callable[[Any], Awaitable[Any]]) -> None:
+        """Keep a handler."""
+        self.registered[verb] = handler
+
+    async def call(self, gateway: str, verb: str, request: Any, reply: type[Any], *, timeout_s: float = 5.0) -> Any:
+        """Ask the test."""
+        self.calls.append((gateway, verb, request))
+        await asyncio.sleep(0)
+        if verb not in self.on:
+            raise UnreachableError(f"nobody answers {verb} on {gateway}")
+        return await self.on[verb](gateway, request)
+
+
+class FakeStore:
+    """Keys and values; `problem` makes writes fail."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, bytes] = {}
+        self.problem: SwiftbotError | None = None
+
+    async def put(self, key: str, value: bytes, *, durable: bool = True) -> None:
+        """Keep."""
+        if self.problem:
+            raise self.problem
+        self.values[key] = value
+
+    async def delete(self, key: str) -> None:
+        """Forget."""
+        self.values.pop(key, None)
+
+    async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
+        """Return what begins so."""
+        return [(key, value) for key, value in self.values.items() if key.startswith(prefix)]
+
+
+class FakeRegistry:
+    """Facts of others."""
+
+    def __init__(self) -> None:
+        self.gateways: dict[str, Any] = {}
+        self.containers: dict[str, Any] = {}
+        self.robots: dict[str, Any] = {}
+        self.on_change: list[Callable[[str], None]] = []
+        self.ages: dict[str, float] = {}
+
+    def age_s(self, gateway: str) -> float:
+        """Return what the test says; by default nothing was ever heard."""
+        return self.ages.get(gateway, math.inf)
+
+    def keeps_promise(self, gateway: str) -> bool:
+        """Return that nobody promised anything."""
+        return False
+
+    def stale_s(self, gateway: str) -> float:
+        """Return that nobody is late."""
+        return 0.0
+
+    def doubt(self, gateway: str) -> None:
+        """Ask nobody."""
+
+    def asked(self, image: str, *, here: bool = True) -> None:
+        """Take no notice."""
+
+
+class FakeRing:
+    """One owner for all."""
+
+    def __init__(self, owner: str) -> None:
+        self.name = owner
+
+    def owner(self, key: str) -> str:
+        """Return it."""
+        return self.name
+
+    def successors(self, key: str, count: int) -> tuple[str, ...]:
+        """Return three."""
+        return ("gw-1", "gw-2", "gw-3")[:count]
+
+
+class FakePlane:
+    """A plane in memory."""
+
+    plan_of = staticmethod(plan_of)
+
+    def __init__(self, gateway: str = "gw-1") -> None:
+        self.gateway = gateway
+        self.session = FakeSession()
+        self.keys = self.session.keys
+        self.dht = FakeDht(gateway)
+        self.rpc = FakeRpc()
+        self.store = FakeStore()
+        self.registry = FakeRegistry()
+        self.ring = FakeRing(gateway)
+        self.present = {"gw-1", "gw-2", "gw-3"}
+        self.on_member_lost: list[Callable[[str], None]] = []
+
+    async def owner_of(self, key: str) -> str:
+        """Return the one owner."""
+        return self.ring.owner(key)
+
+    def members(self) -> frozenset[str]:
+        """Return who is there."""
+        return frozenset(self.present)
+
+    def accepted(self, task: str = "t-1", plan: Plan | None = None) -> TaskRecord:
+        """Return a record just accepted here."""
+        return accepted(task, plan, self.gateway)
