@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from appliance import logs, service
 from appliance.config import GatewayConfig
-from appliance.errors import ConfigError, PrerequisiteError, RefusedError, SwiftbotError
+from appliance.errors import ConfigError
 from appliance.limits import orders_of
 from appliance.llm.api import SwapAsk, Swapped
 from appliance.llm.cascade import Decomposer
@@ -35,35 +35,29 @@ from appliance.model import (
     PoolHint,
     RunRequest,
     Site,
-    TaskRecord,
-    TaskRequest,
 )
 from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
-from appliance.pool.state import ALONE, State
-from appliance.pool.storage import PodmanStorage
-from appliance.pool.transfer.transfers import Transfers
-from appliance.pool.volumes import Volumes
+from appliance.robot_tasks import RobotTasks
 from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk
 from appliance.robots.authority.authority import SHOWN, Authority
-from appliance.robots.doors import Tasks
+from appliance.robots.bounds import Orders
 from appliance.robots.hub import RobotHub
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
-from appliance.tasks.api import ArtifactAsk, RunAsk, SiteAsk, TaskAsk, TaskLinesAsk
+from appliance.state_here import StateHere
+from appliance.tasks.api import ArtifactAsk, RunAsk, SiteAsk, TaskLinesAsk
 from appliance.tasks.artifacts import Artifacts
-from appliance.tasks.bounds import clean
 from appliance.tasks.calls import Calls
 from appliance.tasks.executor import Executor
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.migration.leaving import Leaving
 from appliance.tasks.migration.migration import Migration
 from appliance.tasks.migration.overload import Load
-from appliance.tasks.remote import Links, RemoteContainers, UnmeasuredLinks
+from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.retention import Retention
-from appliance.tasks.steering.api import CancelTaskAsk
 from appliance.tasks.steering.audit import Audit
 from appliance.tasks.steering.enquiries import Enquiries
 from appliance.tasks.watch.kept import Kept
@@ -74,8 +68,6 @@ log = structlog.get_logger(__name__)
 VERSION = "0.1.0"
 SETTLE_S = 3.0
 """How long a draining gateway waits for the ends of its runs to be written: a replicated write takes milliseconds."""
-MOST_HANDED_IN = 64
-"""Tasks of robots on their way at once; a robot that asks faster is refused, and counted."""
 
 
 class Gateway:
@@ -89,11 +81,6 @@ class Gateway:
         self._vitals = Vitals()
         self._changed = asyncio.Event()
         self._draining = False
-        self._ready = asyncio.Event()
-        """Tasks can be handed in."""
-        self._handing_in: set[asyncio.Task[None]] = set()
-        self._volumes: Volumes | None = None
-        self._transfers: Transfers | None = None
         self._kept = Kept(config.id)
         """The last lines about tasks that this gateway has said."""
 
@@ -104,13 +91,6 @@ class Gateway:
         except BaseException:
             await self._stack.aclose()
             raise
-
-    def _serve_links(self) -> None:
-        """Answer what is asked and ordered of MAVLink links."""
-        rpc = self.plane.rpc
-        rpc.register("robot_links", LinksAsk, self.hub.links)
-        rpc.register("robot_link_add", LinkAdd, self.hub.add_link)
-        rpc.register("robot_link_remove", LinkRemove, self.hub.remove_link)
 
     async def _start(self) -> None:
         config = self.config
@@ -127,30 +107,7 @@ class Gateway:
         audit = Audit(self.plane.session, self.plane.keys, config.id)
         self._stack.callback(audit.listen().close)
         orders = orders_of(config, site, roster=lambda: self.plane.registry.robots)
-        self.authority = Authority(self.plane, orders=orders.held)
-        await self.authority.start(audit.signed)
-        self._stack.push_async_callback(self.authority.close)
-        self.authority.on_change.append(self._changed.set)
-
-        self.hub = RobotHub(
-            config.robots,
-            session=self.plane.session,
-            store=self.plane.store,
-            gateway=config.id,
-            site=site,
-            on_task=self._on_robot_task,
-            tasks=Tasks(
-                submit=self._submit_for_link,
-                cancel=self._cancel_for_link,
-                look=self._look_for_robot,
-                submit_of=self._submit_of_robot,
-            ),
-            gate=self.authority.refuses,
-        )
-        await self.hub.start()
-        self._stack.push_async_callback(self.hub.stop)
-
-        self._serve_links()
+        await self._start_robots(site, audit, orders)
 
         artifacts = Artifacts(
             self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
@@ -166,8 +123,14 @@ class Gateway:
             enquiries=enquiries,
             orders=orders.held,
         )
-        state, links = await self._open_state()
-        self._remote = remote = RemoteContainers(self.plane, successors=config.plane.find_successors, links=links)
+        self._storage = storage = StateHere(
+            config.pool, plane=self.plane, fleet=config.fleet, data_dir=self._data, on_change=self._changed.set
+        )
+        self._stack.push_async_callback(storage.close)
+        await storage.open()
+        self._remote = remote = RemoteContainers(
+            self.plane, successors=config.plane.find_successors, links=storage.links
+        )
 
         async def on_call(call: Call) -> dict[str, object]:
             return await self._leaving.guard(call, calls)
@@ -183,7 +146,7 @@ class Gateway:
             facts=remote.facts,
             on_call=on_call,
             on_change=self._on_containers,
-            state=state,
+            state=storage.state,
             store=self.plane.store,
             on_decided=self._tell_decided,
         )
@@ -233,18 +196,43 @@ class Gateway:
             tasks=self.manager,
             config=config.tasks.migration,
             load=self._own_load,
-            volumes_mb=lambda names: self._volumes.size_bytes(names) / 2**20 if self._volumes is not None else 0.0,
+            volumes_mb=storage.volumes_mb,
             on_change=self._changed.set,
             audit=audit,
         )
         self.migration.start()
         self._stack.push_async_callback(self.migration.close)
-        self._ready.set()
-        self._stack.callback(self._drop_intake)
+        self._robot_tasks.open(self.manager)
+        self._stack.callback(self._robot_tasks.close)
         self._publish_status()
         for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
             self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
+
+    async def _start_robots(self, site: Site, audit: Audit, orders: Orders) -> None:
+        config = self.config
+        self.authority = Authority(self.plane, orders=orders.held)
+        await self.authority.start(audit.signed)
+        self._stack.push_async_callback(self.authority.close)
+        self.authority.on_change.append(self._changed.set)
+
+        self._robot_tasks = RobotTasks(self.plane, config.safety)
+        self.hub = RobotHub(
+            config.robots,
+            session=self.plane.session,
+            store=self.plane.store,
+            gateway=config.id,
+            site=site,
+            on_task=self._robot_tasks.take,
+            tasks=self._robot_tasks.doors(),
+            gate=self.authority.refuses,
+        )
+        await self.hub.start()
+        self._stack.push_async_callback(self.hub.stop)
+        rpc = self.plane.rpc
+        rpc.register("robot_links", LinksAsk, self.hub.links)
+        rpc.register("robot_link_add", LinkAdd, self.hub.add_link)
+        rpc.register("robot_link_remove", LinkRemove, self.hub.remove_link)
 
     async def _start_planner(self, catalogue: Catalogue) -> None:
         config, plane = self.config, self.plane
@@ -280,48 +268,6 @@ class Gateway:
 
         return name
 
-    async def _open_state(self) -> tuple[State, Links]:
-        """Open the ledger of state volumes and the transfers of them and of images; neither without Podman."""
-        config = self.config
-        try:
-            storage = PodmanStorage(config.pool.podman_url)
-        except PrerequisiteError as error:
-            log.warning("state volumes and images cannot be moved", reason=str(error))
-            return ALONE, UnmeasuredLinks()
-
-        async def let_go() -> None:
-            await asyncio.to_thread(storage.close)
-
-        self._stack.push_async_callback(let_go)
-        plane, settings = self.plane, config.pool.transfer
-        self._volumes = volumes = Volumes(
-            settings, fleet=config.fleet, gateway=config.id, store=plane.store, records=plane.dht, storage=storage
-        )
-        await volumes.start()
-        self._stack.push_async_callback(volumes.close)
-        volumes.on_change = self._changed.set
-        plane.registry.on_change.append(self._hear_of_volumes)
-        plane.on_member_lost.append(lambda gateway: volumes.hear(gateway, ()))
-        self._transfers = transfers = Transfers(
-            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data
-        )
-        await transfers.start()
-        self._stack.push_async_callback(transfers.close)
-        transfers.on_change = self._changed.set
-        state = State(
-            bring=transfers.bring_newest,
-            use=volumes.use,
-            newest_here=volumes.newest_here,
-            bring_image=transfers.bring_image,
-        )
-        return state, transfers
-
-    def _hear_of_volumes(self, what: str) -> None:
-        if what == "gateway" and self._volumes is not None:
-            for gateway, status in self.plane.registry.gateways.items():
-                if gateway != self.config.id:
-                    self._volumes.hear(gateway, status.volumes)
-
     def _load(self) -> tuple[Catalogue, Site]:
         catalogue = load_catalogue(tuple(Path(each).expanduser() for each in self.config.skills))
         return catalogue, load_site(self.config.site)
@@ -347,7 +293,7 @@ class Gateway:
 
     async def stop(self) -> None:
         """Drain, then stop every part in reverse order."""
-        self._draining = True
+        self._draining = self._robot_tasks.draining = True
         draining = self.migration.draining
         draining.begin(max(0.001, self.config.drain_s), stopping=True)
         self._publish_status()
@@ -400,88 +346,13 @@ class Gateway:
     def _on_wait(self, call: Call, note: str) -> None:
         self.executor.waits(call, note)
 
-    def _on_robot_task(self, robot: str, request: TaskRequest) -> None:
-        """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""
-        if not self.plane.dht.owns(f"robot/{robot}"):
-            return
-        if len(self._handing_in) >= MOST_HANDED_IN:
-            self._refuse_intake(robot, f"{MOST_HANDED_IN} tasks of robots are being handed in")
-            return
-        handing_in = asyncio.create_task(self._hand_in(robot, request), name=f"task of {robot}")
-        self._handing_in.add(handing_in)
-        handing_in.add_done_callback(self._handing_in.discard)
-
-    async def _hand_in(self, robot: str, request: TaskRequest) -> None:
-        # Robots are heard before the task manager is there.
-        await self._ready.wait()
-        try:
-            await self._submit_own(robot, request)
-        except SwiftbotError as error:
-            self._refuse_intake(robot, str(error))
-        except Exception as error:  # the boundary to what a robot sent: it is told in the log, and counted
-            log.exception("a robot's task broke", robot=robot)
-            self._refuse_intake(robot, f"{type(error).__name__}: {error}")
-
-    async def _submit_own(self, robot: str, request: TaskRequest) -> TaskRecord:
-        """Hand in a task as the robot's on whose key it came, whomever it names."""
-        safety = self.config.safety
-        if safety.robot_tasks != "any" or (request.plan is not None and safety.confirm_skills):
-            self._check_known(robot)
-        return await self.manager.submit(msgspec.structs.replace(request, submitter=robot))
-
-    def _check_known(self, robot: str) -> None:
-        """Refuse a task on the key of a robot that nobody knows: it would count as an operator's."""
-        if robot not in self.plane.registry.robots:
-            raise RefusedError(
-                f"there is no robot {clean(robot, 80)} that has told its state, and [safety] holds for robots' tasks",
-                remedy="put its state on its key first",
-            )
-
-    async def _submit_of_robot(self, robot: str, request: TaskRequest) -> TaskRecord:
-        """Hand in a task that a robot asked for by query; durable when this returns."""
-        self._check_ready()
-        return await self._submit_own(robot, request)
-
-    async def _submit_for_link(self, request: TaskRequest) -> TaskRecord:
-        """Hand in a task by MAVLink, whose desks say who asked; durable when this returns."""
-        self._check_ready()
-        return await self.manager.submit(request)
-
-    async def _cancel_for_link(self, task: str, by: str) -> TaskRecord:
-        """Stop a task, as whoever spoke on a link wants; a robot whose tasks may do less stops its own alone."""
-        self._check_ready()
-        if self.config.safety.robot_tasks != "any" and by in self.plane.registry.robots:
-            record = await self.manager.task(TaskAsk(id=task))
-            if record.submitter != by:
-                raise RefusedError(
-                    f"{task} is not a task of {by} (safety.robot_tasks)", remedy="an operator can stop it"
-                )
-        return await self.manager.cancel(CancelTaskAsk(id=task, by=by))
-
-    async def _look_for_robot(self, task: str) -> TaskRecord:
-        self._check_ready()
-        return await self.manager.task(TaskAsk(id=task))
-
-    def _check_ready(self) -> None:
-        if not self._ready.is_set() or self._draining:
-            raise RefusedError(f"{self.config.id} is {'draining' if self._draining else 'starting'}")
-
-    def _refuse_intake(self, robot: str, reason: str) -> None:
-        self.plane.session.refused["robot task"] = self.plane.session.refused.get("robot task", 0) + 1
-        log.warning("a robot's task is refused", robot=robot, reason=reason)
-
-    def _drop_intake(self) -> None:
-        for handing_in in self._handing_in:
-            handing_in.cancel()
-
     def status(self) -> GatewayStatus:
         """This gateway's account of itself."""
         containers = self.pool.containers()
         capacity = self.config.pool.capacity
         vitals = self._vitals.read()
-        moving = [each.refused for each in (self._volumes, self._transfers) if each is not None]
         counters = Counter[str]()
-        for each in (self.plane.session.refused, self.hub.refused, self.pool.refused, *moving):
+        for each in (self.plane.session.refused, self.hub.refused, self.pool.refused, *self._storage.refused):
             counters.update(each)
         return GatewayStatus(
             id=self.config.id,
@@ -505,8 +376,8 @@ class Gateway:
             searches=dict(self._remote.searches),
             limits_enforced=self.pool.limits_enforced,
             pool_problem=self.pool.problem or self.pool.squeeze,
-            images=self._transfers.images() if self._transfers is not None else (),
-            volumes=self._volumes.infos() if self._volumes is not None else (),
+            images=self._storage.images(),
+            volumes=self._storage.volumes(),
             models=self.decomposer.models,
             planner=self.decomposer.status,
             robots=self.hub.attached,

@@ -10,12 +10,11 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-import msgspec
 import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, PayloadError, PoolError, RefusedError, SwiftbotError, UnreachableError
+from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.model import (
     Failure,
     Phase,
@@ -24,7 +23,6 @@ from appliance.model import (
     RunEvent,
     RunEventKind,
     RunRequest,
-    encode,
 )
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
@@ -32,25 +30,19 @@ from appliance.plane.session import Closer, Message
 from appliance.pool.api import Hinted
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Decision
-from appliance.pool.turns import turn_of
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.checkpoints import Checkpoints
+from appliance.tasks.choosing import Choosing
 from appliance.tasks.elsewhere import Elsewhere
-from appliance.tasks.passing import ORDER_S, PassedOn, Passing, explained, passed_on
+from appliance.tasks.kept_runs import KeptRuns
+from appliance.tasks.passing import PassedOn, Passing
 from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.surroundings import task_key
 from appliance.tasks.telling import Telling
 
 log = structlog.get_logger(__name__)
-
-REMOTE_TRIES = 3
-"""Other gateways that are tried for one run before what is here has to do."""
-MAX_VERDICT = 80
-KEPT_RUNS = 2000
-"""Last events kept of ended runs; a coordinator asks within seconds."""
 
 
 class Here(Struct):
@@ -68,7 +60,6 @@ class Executor:
 
     def __init__(self, plane: Plane, pool: Pool, remote: RemoteContainers, config: TasksConfig) -> None:
         self._plane = plane
-        self._remote = remote
         self._config = config
         self._records: Closer | None = None
         self._pool = pool
@@ -78,10 +69,10 @@ class Executor:
         self._accepting: dict[str, asyncio.Task[RunAccepted]] = {}
         self._withdrawn: set[str] = set()
         """Orders being decided on that must not begin any more."""
+        self._choosing = Choosing(plane, pool, remote, check=self._check)
         self._passing = Passing(plane, pool, Elsewhere(plane, pool, remote, self._order_of))
-        self._last: dict[str, RunEvent] = {}
+        self._kept = KeptRuns(plane.store, plane.gateway)
         self._background: set[asyncio.Future[object]] = set()
-        self._attempts: dict[tuple[str, str], int] = {}
         self.telling = Telling(plane)
         self._checkpoints = Checkpoints(
             plane.dht,
@@ -107,28 +98,7 @@ class Executor:
     async def start(self) -> None:
         """Load what was kept; a run that was in progress when the gateway went down has failed."""
         self._records = self._plane.session.subscribe(self._plane.keys.task(), self._on_record)
-        for key, value in await self._plane.store.scan("run/"):
-            run_id = key.removeprefix("run/")
-            try:
-                event = msgspec.json.decode(value, type=RunEvent)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-                log.warning("a kept run event cannot be read and is dropped", run=run_id, reason=str(error))
-                await self._plane.store.delete(key)
-                continue
-            if event.gateway not in ("", self._plane.gateway):
-                self._passing.moved[run_id] = event.gateway
-            elif event.kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
-                event = replace(
-                    event,
-                    kind=RunEventKind.FAILED,
-                    failure=Failure(
-                        code="unreachable",
-                        message=f"{self._plane.gateway} was restarted while it ran",
-                        retryable=True,
-                    ),
-                )
-                await self._plane.store.put(key, encode(event))
-            self._remember(run_id, event)
+        self._passing.moved.update(await self._kept.load())
         self._passing.start()
 
     async def run(self, request: RunRequest) -> RunAccepted:
@@ -166,7 +136,7 @@ class Executor:
         self._check(request)
         await self._end_older(request)
         received_ns = time.monotonic_ns()
-        decision = await self._decide(request)
+        decision = self.reserved(request) or await self._choosing.choose(request)
         if isinstance(decision, RunAccepted):
             return decision
         if request.hops and decision.phase is Phase.COLD and not (request.anew and self._pool.has_room(request.need)):
@@ -199,59 +169,9 @@ class Executor:
         self.on_change()
         return accepted
 
-    async def _decide(self, request: RunRequest) -> Decision | RunAccepted:
-        """Select a container; one on another gateway is reserved and started there by the order to run itself.
-
-        An offer that turns out to be nothing is counted, explained in the choice, and the next best is taken; the
-        last try is without other gateways.
-        """
-        if (reserved := self.reserved(request)) is not None:
-            return reserved
-        remote, inputs = self._remote, bytes_by_gateway(request.inputs)
-        avoid = {
-            **remote.left_out(),
-            **self._outside(request),
-            **dict.fromkeys(request.avoid, "an earlier attempt failed there"),
-        }
-        for left in reversed(range(REMOTE_TRIES + 1)):
-            decision = await self._pool.select(
-                request.need,
-                allow_remote=request.hops == 0 and left > 0,
-                inputs=inputs,
-                avoid=avoid,
-                turn=turn_of(request),
-            )
-            if decision.phase is not Phase.REMOTE_WARM:
-                return explained(decision, avoid)
-            self._check(request)
-            gateway = decision.gateway
-            remote.promise(gateway)
-            try:
-                accepted = await self._plane.rpc.call(
-                    gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
-                )
-            except DeadlineError as error:
-                # It may run there or not: only a new attempt, which ends this one wherever it is, is safe.
-                raise UnreachableError(f"{gateway} did not say whether it runs {request.run_id}") from error
-            except SwiftbotError as error:
-                # The container was taken, or was never there, or its gateway went away meanwhile.
-                remote.turned_out(gateway, good=False)
-                avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}
-                self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
-            else:
-                remote.turned_out(gateway, good=True, container=accepted.container)
-                return passed_on(accepted, explained(decision, avoid))
-        raise PoolError("a selection without other gateways chose one")
-
-    def _outside(self, request: RunRequest) -> dict[str, str]:
-        """Gateways that the run may not be passed on to."""
-        if not request.group:
-            return {}
-        return {each: "the submitter does not allow it" for each in self._plane.members() if each not in request.group}
-
     def _check(self, request: RunRequest) -> None:
         """Refuse what must not begin (any more)."""
-        newest = self._attempts.get((request.task, request.subtask), 0)
+        newest = self._kept.newest(request.task, request.subtask)
         if request.attempt < newest:
             raise RefusedError(f"attempt {request.attempt} of {request.subtask} is outdated by attempt {newest}")
         if self.draining:
@@ -268,14 +188,14 @@ class Executor:
             if told.kind is RunEventKind.STARTED and told.startup_ms is not None:
                 told = replace(told, startup_ms=told.startup_ms + waited_ms)
             if told.kind is RunEventKind.STARTED:
-                self._last[run_id] = told
+                self._kept.last[run_id] = told
                 self._here[run_id].began = True
             if told.kind is RunEventKind.CHECKPOINT:
                 self._checkpoints.add(told)
             else:
                 self.telling.tell(told)
 
-        begun = asyncio.create_task(self._keep(run_id, self._last[run_id]))
+        begun = asyncio.create_task(self._kept.keep(run_id, self._kept.last[run_id]))
         try:
             final = await self._passing.run(request, decision, tell, since=received_ns / 1e9, check=self._check)
         except SwiftbotError as error:
@@ -291,7 +211,7 @@ class Executor:
             self._remember(run_id, final.event)
             self.telling.tell(final.event)
             await begun
-            await self._keep(run_id, final.event)
+            await self._kept.keep(run_id, final.event)
             if run_id in self._withdrawn:
                 await self._passing.ask(run_id, "run_cancel")
             return
@@ -301,20 +221,13 @@ class Executor:
         await begun
         await self._checkpoints.end(final)
         # Kept before it is told: a coordinator that misses the event finds it here.
-        await self._keep(run_id, final)
+        await self._kept.keep(run_id, final)
         self.telling.tell(final)
-
-    async def _keep(self, run_id: str, event: RunEvent) -> None:
-        """Keep an event over a restart; a store that cannot must not keep the outcome from being told."""
-        try:
-            await self._plane.store.put(f"run/{run_id}", encode(event), durable=False)
-        except SwiftbotError as error:
-            log.warning("run event could not be kept", run=run_id, reason=str(error))
 
     def waits(self, call: Call, note: str) -> None:
         """Tell that a run waits for something, as its progress."""
         run = call.run
-        last = self._last.get(run.run_id)
+        last = self._kept.last.get(run.run_id)
         self.telling.tell(
             RunEvent(
                 task=run.task,
@@ -328,21 +241,13 @@ class Executor:
         )
 
     def _remember(self, run_id: str, event: RunEvent) -> None:
-        self._last[run_id] = event
-        key = (event.task, event.subtask)
-        self._attempts[key] = max(event.attempt, self._attempts.get(key, 0))
-        while len(self._last) > KEPT_RUNS:
-            oldest = next((each for each in self._last if each not in self._running), None)
-            if oldest is None:
-                return
+        for oldest in self._kept.remember(run_id, event, busy=self._running.keys()):
             self._forget(oldest)
 
     def _forget(self, run_id: str) -> None:
-        gone = self._last.pop(run_id)
         self._accepted.pop(run_id, None)
         self._passing.moved.pop(run_id, None)
-        self._attempts.pop((gone.task, gone.subtask), None)
-        self._later(self._plane.store.delete(f"run/{run_id}"))
+        self._later(self._kept.forget(run_id))
 
     async def _end_older(self, request: RunRequest) -> None:
         """End an outdated attempt that still runs here, or is about to."""
@@ -356,7 +261,7 @@ class Executor:
     def _on_record(self, message: Message) -> None:
         """End runs whose attempt the record has left behind; forget the runs of a task that has ended."""
         task = message.key.split("/")[-2]
-        mine = [run_id for run_id in self._last if run_id.startswith(f"{task}/")]
+        mine = [run_id for run_id in self._kept.last if run_id.startswith(f"{task}/")]
         coming = [run_id for run_id in self._accepting if run_id.startswith(f"{task}/")]
         if not (mine or coming) or message.deleted:
             return
@@ -373,7 +278,7 @@ class Executor:
             if record.state.final or _number(run_id) < attempts.get(run_id.split("/")[1], 0):
                 self._withdrawn.add(run_id)
         for run_id in mine:
-            event = self._last[run_id]
+            event = self._kept.last[run_id]
             # A revised plan may have no such subtask any more.
             gone = bool(attempts) and event.subtask not in attempts
             outdated = gone or event.attempt < attempts.get(event.subtask, 0)
@@ -436,7 +341,7 @@ class Executor:
         position = waiting.index(ask.run_id) + 1 if ask.run_id in waiting else 0
         return RunStatus(
             running=running,
-            last=self._last.get(ask.run_id),
+            last=self._kept.last.get(ask.run_id),
             silent_s=self.telling.silent_s(ask.task, ask.subtask, ask.attempt) if running and not position else None,
             position=position,
             queue=len(waiting) if position else 0,

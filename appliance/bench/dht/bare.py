@@ -13,6 +13,7 @@ import random
 import sys
 import time
 from functools import partial
+from typing import Any, cast
 
 import uvloop
 import zenoh
@@ -96,7 +97,8 @@ async def serve(nodes: int) -> None:
 async def _known(session: zenoh.Session, key: str) -> None:
     """Wait until somebody serves a key for this session."""
     with session.declare_querier(key) as querier:
-        while not querier.matching_status.matching:  # noqa: ASYNC110 - a listener would only say so on another thread
+        # The stubs take the status for a bool; it is a structure with one.
+        while not cast("Any", querier.matching_status).matching:  # noqa: ASYNC110 - a listener would only say so on another thread
             await asyncio.sleep(0.01)
 
 

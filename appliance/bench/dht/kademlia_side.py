@@ -41,7 +41,7 @@ def durable(path: Path) -> Any:
     class Durable(memory):
         def __setitem__(self, key: bytes, value: str) -> None:
             db.execute("INSERT OR REPLACE INTO stored VALUES (?, ?)", (key, value))
-            super().__setitem__(key, value)
+            memory.__setitem__(self, key, value)
 
     return Durable()
 

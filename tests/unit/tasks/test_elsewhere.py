@@ -177,7 +177,7 @@ async def test_a_waiting_run_goes_where_a_container_becomes_ready(executor: Exec
     assert (await executor.status(ASK)).running
     await executor.cancel(ASK)
     assert [(gateway, verb) for gateway, verb, _ in plane.rpc.calls][-1] == ("gw-2", "run_cancel")
-    assert executor._remote.searches["moved"] == 1
+    assert executor._choosing._remote.searches["moved"] == 1
 
 
 async def test_a_pool_that_keeps_to_itself_offers_nothing(plane: Any, pool: Any, tasks_config: Any) -> None:

@@ -1,0 +1,132 @@
+"""Tasks that robots ask this gateway for: whose they are, which are refused, and that each is done once.
+
+A robot asks on its own key, by a message or by a query, or over a MAVLink link. Whatever it says of who it is, a task
+on its key is its own. What comes before the task manager is there waits for it, or is told to ask again.
+"""
+
+import asyncio
+
+import msgspec
+import structlog
+
+from appliance.errors import RefusedError, SwiftbotError
+from appliance.llm.safety.settings import SafetyConfig
+from appliance.model import TaskRecord, TaskRequest
+from appliance.plane.node import Plane
+from appliance.robots.doors import Tasks
+from appliance.tasks.api import TaskAsk
+from appliance.tasks.bounds import clean
+from appliance.tasks.manager import TaskManager
+from appliance.tasks.steering.api import CancelTaskAsk
+
+log = structlog.get_logger(__name__)
+
+MOST_HANDED_IN = 64
+"""Tasks of robots on their way at once; a robot that asks faster is refused, and counted."""
+
+
+class RobotTasks:
+    """The intake of one gateway; `open` once tasks can be handed in."""
+
+    def __init__(self, plane: Plane, safety: SafetyConfig) -> None:
+        self.draining = False
+        self._plane = plane
+        self._safety = safety
+        self._manager: TaskManager | None = None
+        self._opened = asyncio.Event()
+        self._handing_in: set[asyncio.Task[None]] = set()
+
+    def doors(self) -> Tasks:
+        """What robots may ask of the fleet's tasks."""
+        return Tasks(submit=self.submit, cancel=self.cancel, look=self.look, submit_of=self.submit_of)
+
+    def open(self, manager: TaskManager) -> None:
+        """Hand in what waits, and what comes."""
+        self._manager = manager
+        self._opened.set()
+
+    def close(self) -> None:
+        """Give up what is on its way."""
+        for handing_in in self._handing_in:
+            handing_in.cancel()
+
+    # --- messages ---------------------------------------------------------------------------------------------
+
+    def take(self, robot: str, request: TaskRequest) -> None:
+        """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""
+        if not self._plane.dht.owns(f"robot/{robot}"):
+            return
+        if len(self._handing_in) >= MOST_HANDED_IN:
+            self._refuse(robot, f"{MOST_HANDED_IN} tasks of robots are being handed in")
+            return
+        handing_in = asyncio.create_task(self.hand_in(robot, request), name=f"task of {robot}")
+        self._handing_in.add(handing_in)
+        handing_in.add_done_callback(self._handing_in.discard)
+
+    async def hand_in(self, robot: str, request: TaskRequest) -> None:
+        """Hand in what a robot put on its key; nobody waits for an answer."""
+        # Robots are heard before the task manager is there.
+        await self._opened.wait()
+        try:
+            await self._submit_own(robot, request)
+        except SwiftbotError as error:
+            self._refuse(robot, str(error))
+        except Exception as error:  # the boundary to what a robot sent: it is told in the log, and counted
+            log.exception("a robot's task broke", robot=robot)
+            self._refuse(robot, f"{type(error).__name__}: {error}")
+
+    def _refuse(self, robot: str, reason: str) -> None:
+        self._plane.session.refused["robot task"] = self._plane.session.refused.get("robot task", 0) + 1
+        log.warning("a robot's task is refused", robot=robot, reason=reason)
+
+    # --- questions --------------------------------------------------------------------------------------------
+
+    async def submit_of(self, robot: str, request: TaskRequest) -> TaskRecord:
+        """Hand in a task that a robot asked for by query; durable when this returns."""
+        self._ready()
+        return await self._submit_own(robot, request)
+
+    async def submit(self, request: TaskRequest) -> TaskRecord:
+        """Hand in a task by MAVLink, whose desks say who asked; durable when this returns."""
+        return await self._ready().submit(request)
+
+    async def cancel(self, task: str, by: str) -> TaskRecord:
+        """Stop a task, as whoever spoke on a link wants; a robot whose tasks may do less stops its own alone."""
+        manager = self._ready()
+        if self._safety.robot_tasks != "any" and by in self._plane.registry.robots:
+            record = await manager.task(TaskAsk(id=task))
+            if record.submitter != by:
+                raise RefusedError(
+                    f"{task} is not a task of {by} (safety.robot_tasks)", remedy="an operator can stop it"
+                )
+        return await manager.cancel(CancelTaskAsk(id=task, by=by))
+
+    async def look(self, task: str) -> TaskRecord:
+        """How a task stands."""
+        return await self._ready().task(TaskAsk(id=task))
+
+    # --- both -------------------------------------------------------------------------------------------------
+
+    async def _submit_own(self, robot: str, request: TaskRequest) -> TaskRecord:
+        """Hand in a task as the robot's on whose key it came, whomever it names."""
+        if self._safety.robot_tasks != "any" or (request.plan is not None and self._safety.confirm_skills):
+            self._check_known(robot)
+        return await self._opened_manager().submit(msgspec.structs.replace(request, submitter=robot))
+
+    def _check_known(self, robot: str) -> None:
+        """Refuse a task on the key of a robot that nobody knows: it would count as an operator's."""
+        if robot not in self._plane.registry.robots:
+            raise RefusedError(
+                f"there is no robot {clean(robot, 80)} that has told its state, and [safety] holds for robots' tasks",
+                remedy="put its state on its key first",
+            )
+
+    def _ready(self) -> TaskManager:
+        if self.draining:
+            raise RefusedError(f"{self._plane.gateway} is draining")
+        return self._opened_manager()
+
+    def _opened_manager(self) -> TaskManager:
+        if self._manager is None:
+            raise RefusedError(f"{self._plane.gateway} is starting")
+        return self._manager
