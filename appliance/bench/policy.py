@@ -20,7 +20,7 @@ from appliance.errors import ConfigError
 from appliance.pool.policies import Evictor
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Outcome, Trace, simulate
-from appliance.pool.simulator.clairvoyant import Belady, least_cold
+from appliance.pool.simulator.clairvoyant import Belady, least_cold, least_cold_within
 from appliance.pool.simulator.traces import azure, plain
 
 Progress = Callable[[str], None]
@@ -30,6 +30,8 @@ FOREVER_S = 1e9
 DEFAULT = "default"
 KEEP_ALIVE = "keep-alive"
 CLAIRVOYANT = "clairvoyant"
+BY_NUMBER = "clairvoyant-number"
+"""Policies with a crystal ball: one saves the most time, as the default is meant to, one the most cold starts."""
 FLEET = 10
 """Gateways of the fleet in which the shipped default, which is federated, is held against keep-alive."""
 FLEET_TRACES: dict[str, Callable[[int], Trace]] = {
@@ -122,7 +124,7 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
     `on_frontier`, whether no point of another policy, with no more memory for its containers, is better by 5 % in one
     of the two (and by 0.1 % of the runs, less is chance) at no more than 2 % worse in the other.
     """
-    others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT} for each in curve]
+    others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT, BY_NUMBER} for each in curve]
     most_gb = 1.02 * max(each.wasted_gb for each in curves[KEEP_ALIVE])
     return {
         str(mine.budget_mb): {
@@ -149,12 +151,16 @@ def on_traces(
 ) -> dict[str, Any]:
     """Return every policy's curve, the clairvoyant ones beside them, and how the default stands.
 
+    `possible` is by how many percent fewer cold starts than keep-alive with the same budget there can be: below the
+    bound nobody gets who starts on demand; what the crystal balls reach is what foresight alone is good for.
+
     Several traces are one kind of arrivals drawn with several seeds: each point is the mean over them, since on one
     draw alone two good policies differ by more than they do in general.
     """
     played = [_play(trace, budgets_mb, progress) for trace in traces]
     curves = {name: _mean([each[0][name] for each in played]) for name in played[0][0]}
     bounds = [each[1] for each in played]
+    within = [fmean(each) for each in zip(*(each[2] for each in played), strict=True)]
     return {
         "runs": sum(len(trace.arrivals) for trace in traces),
         "hours": round(sum(trace.duration_s for trace in traces) / 3600, 1),
@@ -162,6 +168,17 @@ def on_traces(
         "draws": len(traces),
         "curves": {name: [_plain(each) for each in curve] for name, curve in curves.items()},
         "bound_at_default_waste": [round(fmean(each), 3) for each in zip(*bounds, strict=True)],
+        "bound_within_budget": [round(each, 3) for each in within],
+        "possible": {
+            str(theirs.budget_mb): {
+                "bound": _fewer(bound, theirs.cold_percent),
+                CLAIRVOYANT: _fewer(saving.cold_percent, theirs.cold_percent),
+                BY_NUMBER: _fewer(sparing.cold_percent, theirs.cold_percent),
+            }
+            for theirs, bound, saving, sparing in zip(
+                curves[KEEP_ALIVE], within, curves[CLAIRVOYANT], curves[BY_NUMBER], strict=True
+            )
+        },
         "default": compare(curves),
         "default_each_draw": [
             {budget: stands["on_frontier"] for budget, stands in compare(each[0]).items()} for each in played
@@ -169,8 +186,13 @@ def on_traces(
     }
 
 
-def _play(trace: Trace, budgets_mb: Sequence[int], progress: Progress) -> tuple[dict[str, list[Point]], list[float]]:
-    """Return every policy's curve on one trace, and the fewest cold starts (percent) with the default's idle memory."""
+def _play(
+    trace: Trace, budgets_mb: Sequence[int], progress: Progress
+) -> tuple[dict[str, list[Point]], list[float], list[float]]:
+    """Return every policy's curve on one trace, and two bounds of cold starts for each budget, percent.
+
+    One is with the default's idle memory on average, the other with no more memory than the budget at any moment.
+    """
     chosen = policies()
     curves: dict[str, list[Point]] = {}
     tick_s = max(1.0, trace.duration_s / TICKS)
@@ -181,18 +203,25 @@ def _play(trace: Trace, budgets_mb: Sequence[int], progress: Progress) -> tuple[
             for budget in budgets_mb
         ]
 
-    def crystal_ball(gateway: int) -> Evictor:
-        return Belady(trace, gateway)
-
     ideal = chosen["greedy-dual"]
-    curves[CLAIRVOYANT] = [
-        point(
-            trace, budget, simulate(trace, replace(ideal, memory_mb=budget), tick_s=tick_s, make_evictor=crystal_ball)
-        )
-        for budget in budgets_mb
-    ]
+    for name, by_number in ((CLAIRVOYANT, False), (BY_NUMBER, True)):
+        progress(f"{trace.name}: {name}")
+
+        def crystal_ball(gateway: int, *, by_number: bool = by_number) -> Evictor:
+            return Belady(trace, gateway, by_number=by_number)
+
+        curves[name] = [
+            point(
+                trace,
+                budget,
+                simulate(trace, replace(ideal, memory_mb=budget), tick_s=tick_s, make_evictor=crystal_ball),
+            )
+            for budget in budgets_mb
+        ]
     bound = least_cold(trace, [each.wasted_gb * 1024 * trace.duration_s for each in curves[DEFAULT]])
-    return curves, [100 * each / len(trace.arrivals) for each in bound]
+    within = least_cold_within(trace, budgets_mb)
+    percent = 100 / len(trace.arrivals)
+    return curves, [percent * each for each in bound], [percent * each for each in within]
 
 
 def _mean(curves: Sequence[Sequence[Point]]) -> list[Point]:

@@ -3,6 +3,7 @@
 import pytest
 
 from appliance.bench.policy import (
+    BY_NUMBER,
     DEFAULT,
     FLEET,
     FLEET_TRACES,
@@ -76,12 +77,14 @@ def test_the_shipped_default_beside_keep_alive_in_a_fleet(monkeypatch: pytest.Mo
 
 
 def test_points_are_means_over_several_draws() -> None:
-    """Two draws of a trace: runs add up, points are the means, and each draw's own verdict stands beside."""
+    """Two draws of a trace: runs add up, points are means; each draw's verdict, and what is possible, are there too."""
     drawn = [plain("poisson", seed=seed, rate=0.5, duration_s=1200.0) for seed in (1, 2)]
     one, other, both = (on_traces(each, (1024,)) for each in (drawn[:1], drawn[1:], drawn))
     assert both["runs"] == one["runs"] + other["runs"]
     cold = [each["curves"][DEFAULT][0]["cold_percent"] for each in (one, other, both)]
     assert cold[2] == pytest.approx((cold[0] + cold[1]) / 2, abs=0.001)
+    possible = both["possible"]["1024"]
+    assert possible["bound"] >= possible[BY_NUMBER] > 0
     assert both["default_each_draw"] == one["default_each_draw"] + other["default_each_draw"]
 
 
