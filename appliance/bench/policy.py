@@ -20,7 +20,7 @@ from appliance.errors import ConfigError
 from appliance.pool.policies import Evictor
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Outcome, Trace, simulate
-from appliance.pool.simulator.clairvoyant import Belady, least_cold, least_cold_within
+from appliance.pool.simulator.clairvoyant import Belady, cold_with_foresight, least_cold, least_cold_within
 from appliance.pool.simulator.traces import azure, plain
 
 Progress = Callable[[str], None]
@@ -152,7 +152,8 @@ def on_traces(
     """Return every policy's curve, the clairvoyant ones beside them, and how the default stands.
 
     `possible` is by how many percent fewer cold starts than keep-alive with the same budget there can be: below the
-    bound nobody gets who starts on demand; what the crystal balls reach is what foresight alone is good for.
+    bound nobody gets who starts on demand; `foresight` is a plan made with all arrivals known, the crystal balls are
+    policies that know when each container is used next.
 
     Several traces are one kind of arrivals drawn with several seeds: each point is the mean over them, since on one
     draw alone two good policies differ by more than they do in general.
@@ -160,7 +161,9 @@ def on_traces(
     played = [_play(trace, budgets_mb, progress) for trace in traces]
     curves = {name: _mean([each[0][name] for each in played]) for name in played[0][0]}
     bounds = [each[1] for each in played]
-    within = [fmean(each) for each in zip(*(each[2] for each in played), strict=True)]
+    within, foresight = (
+        [fmean(each) for each in zip(*(each[which] for each in played), strict=True)] for which in (2, 3)
+    )
     return {
         "runs": sum(len(trace.arrivals) for trace in traces),
         "hours": round(sum(trace.duration_s for trace in traces) / 3600, 1),
@@ -169,14 +172,16 @@ def on_traces(
         "curves": {name: [_plain(each) for each in curve] for name, curve in curves.items()},
         "bound_at_default_waste": [round(fmean(each), 3) for each in zip(*bounds, strict=True)],
         "bound_within_budget": [round(each, 3) for each in within],
+        "with_foresight": [round(each, 3) for each in foresight],
         "possible": {
             str(theirs.budget_mb): {
                 "bound": _fewer(bound, theirs.cold_percent),
+                "foresight": _fewer(planned, theirs.cold_percent),
                 CLAIRVOYANT: _fewer(saving.cold_percent, theirs.cold_percent),
                 BY_NUMBER: _fewer(sparing.cold_percent, theirs.cold_percent),
             }
-            for theirs, bound, saving, sparing in zip(
-                curves[KEEP_ALIVE], within, curves[CLAIRVOYANT], curves[BY_NUMBER], strict=True
+            for theirs, bound, planned, saving, sparing in zip(
+                curves[KEEP_ALIVE], within, foresight, curves[CLAIRVOYANT], curves[BY_NUMBER], strict=True
             )
         },
         "default": compare(curves),
@@ -188,10 +193,11 @@ def on_traces(
 
 def _play(
     trace: Trace, budgets_mb: Sequence[int], progress: Progress
-) -> tuple[dict[str, list[Point]], list[float], list[float]]:
-    """Return every policy's curve on one trace, and two bounds of cold starts for each budget, percent.
+) -> tuple[dict[str, list[Point]], list[float], list[float], list[float]]:
+    """Return every policy's curve on one trace, and three figures of cold starts for each budget, percent.
 
-    One is with the default's idle memory on average, the other with no more memory than the budget at any moment.
+    The bound with the default's idle memory on average, that with no more memory than the budget at any moment, and the
+    plan made with all arrivals known.
     """
     chosen = policies()
     curves: dict[str, list[Point]] = {}
@@ -219,9 +225,14 @@ def _play(
             for budget in budgets_mb
         ]
     bound = least_cold(trace, [each.wasted_gb * 1024 * trace.duration_s for each in curves[DEFAULT]])
-    within = least_cold_within(trace, budgets_mb)
     percent = 100 / len(trace.arrivals)
-    return curves, [percent * each for each in bound], [percent * each for each in within]
+    within, foresight = least_cold_within(trace, budgets_mb), cold_with_foresight(trace, budgets_mb)
+    return (
+        curves,
+        [percent * each for each in bound],
+        [percent * each for each in within],
+        [percent * each for each in foresight],
+    )
 
 
 def _mean(curves: Sequence[Sequence[Point]]) -> list[Point]:

@@ -1,4 +1,4 @@
-"""What could be reached by somebody who knew the future: two bounds, and an eviction policy.
+"""What could be reached by somebody who knew the future: two bounds, a plan, and an eviction policy.
 
 `least_cold` is a true lower bound on the cold starts of every policy that starts containers on demand only (as
 keep-alive, LRU and Greedy-Dual do). Put each image's runs on levels (policies/demand.py): a run that raises their
@@ -13,9 +13,13 @@ are (Fisher 1981): with a price for a megabyte at each moment, every idle time i
 start it saves, and what was not sold of the memory is paid for. The prices are moved until that bound is low. Runs that
 have to wait because those before them fill the budget are taken as if they did not.
 
-`Belady` is no bound but a policy with a crystal ball: at each eviction it gives up the container whose next use is
-latest, weighted by memory over what a cold start counts (Bélády 1966 evicts the latest; exact optimality is lost with
-unequal sizes, for which it is NP-hard).
+`cold_with_foresight` is no bound but a plan that somebody who knew all arrivals could have made: idle times are kept,
+those first that are cheapest at the prices of that bound, as long as there is room at each moment. What is best lies
+between the two.
+
+`Belady` is a policy with a crystal ball: at each eviction it gives up the container whose next use is latest, weighted
+by memory over what a cold start counts (Bélády 1966 evicts the latest; exact optimality is lost with unequal sizes, for
+which it is NP-hard).
 """
 
 import math
@@ -90,19 +94,41 @@ def least_cold(trace: Trace, wasted_mb_s: Sequence[float]) -> list[int]:
 def least_cold_within(trace: Trace, budgets_mb: Sequence[float], *, rounds: int = ROUNDS) -> list[int]:
     """Return a bound below which no policy on demand gets with such memory for all containers, on one gateway."""
     levels = _levels(trace)
-    edges = np.linspace(0.0, max(trace.duration_s, float(np.max(levels.busy[1], initial=0.0))) + 1.0, MOMENTS + 1)
-    # Busy memory at the beginnings and ends of runs: between two of them it is the same.
+    bounds: list[int] = []
+    for budget_mb in budgets_mb:
+        warm, _ = _most_warm(levels, budget_mb, rounds)
+        bounds.append(levels.unavoidable + len(levels.begins) - math.floor(warm + 1e-6))
+    return bounds
+
+
+def cold_with_foresight(trace: Trace, budgets_mb: Sequence[float], *, rounds: int = ROUNDS) -> list[int]:
+    """Return the cold starts of a plan made with all arrivals known, with such memory, on one gateway."""
+    levels = _levels(trace)
+    times, busy_mb = _busy(levels)
+    moments = np.unique(np.concatenate((times, levels.begins, levels.ends)))
+    held_mb = np.concatenate(([0.0], busy_mb))[np.searchsorted(times, moments, side="right")]
+    since, until = np.searchsorted(moments, levels.begins), np.searchsorted(moments, levels.ends)
+    found: list[int] = []
+    for budget_mb in budgets_mb:
+        _, bills = _most_warm(levels, budget_mb, rounds)
+        free_mb = budget_mb - held_mb
+        cold = levels.unavoidable
+        for index in np.argsort(bills, kind="stable"):
+            span = free_mb[since[index] : until[index]]
+            if len(span) and float(span.min()) < levels.memory_mb[index]:
+                cold += 1
+            else:
+                span -= levels.memory_mb[index]
+        found.append(cold)
+    return found
+
+
+def _busy(levels: _Levels) -> tuple[Vector, Vector]:
+    """Return the moments at which runs begin or end, and the memory they hold from each of them on."""
     at, until, held = levels.busy
     times = np.concatenate((at, until))
     order = np.argsort(times, kind="stable")
-    steps = times[order]
-    busy_mb = np.cumsum(np.concatenate((held, -held))[order])
-    bounds: list[int] = []
-    for budget_mb in budgets_mb:
-        room = _integral(edges, steps, np.maximum(0.0, budget_mb - busy_mb), before=float(budget_mb))
-        warm = _most_warm(levels, edges, np.diff(room), rounds)
-        bounds.append(max(levels.unavoidable, levels.unavoidable + len(levels.begins) - math.floor(warm + 1e-6)))
-    return bounds
+    return times[order], np.cumsum(np.concatenate((held, -held))[order])
 
 
 def _integral(edges: Vector, steps: Vector, values: Vector, *, before: float) -> Vector:
@@ -113,27 +139,35 @@ def _integral(edges: Vector, steps: Vector, values: Vector, *, before: float) ->
     return np.interp(edges, whole, sums)
 
 
-def _most_warm(levels: _Levels, edges: Vector, room: Vector, rounds: int) -> float:
-    """Return a bound above which no choice of idle times gets that fits into `room` (MB s in each piece)."""
+def _most_warm(levels: _Levels, budget_mb: float, rounds: int) -> tuple[float, Vector]:
+    """Return a bound above which no choice of idle times gets that fits into what runs leave of a budget.
+
+    Beside it what each idle time costs at the prices that gave it; it is worth keeping below 1.
+    """
     begins, ends, memory_mb = levels.begins, levels.ends, levels.memory_mb
     if not len(begins):
-        return 0.0
+        return 0.0, begins
+    steps, busy_mb = _busy(levels)
+    edges = np.linspace(0.0, float(steps[-1]) + 1.0, MOMENTS + 1)
+    room = np.diff(_integral(edges, steps, np.maximum(0.0, budget_mb - busy_mb), before=float(budget_mb)))
     lengths = np.diff(edges)
     costs = np.sort((ends - begins) * memory_mb)
     # As if the memory could be used at any moment: the price at which it is just sold out.
     last = min(len(costs) - 1, int(np.searchsorted(np.cumsum(costs), float(room.sum()))))
     prices = np.full(len(room), 1.0 / max(1e-9, float(costs[last])))
-    best = float(len(begins))
+    best, cheapest = float(len(begins)), np.zeros(len(begins))
     for step in range(rounds):
         sums = np.concatenate(([0.0], np.cumsum(prices * lengths)))
         bills = memory_mb * (np.interp(ends, edges, sums) - np.interp(begins, edges, sums))
-        best = min(best, float(prices @ room) + float(np.maximum(0.0, 1.0 - bills).sum()))
+        bound = float(prices @ room) + float(np.maximum(0.0, 1.0 - bills).sum())
+        if bound < best:
+            best, cheapest = bound, bills
         kept = bills < 1.0
         used = np.diff(_held(edges, begins[kept], ends[kept], memory_mb[kept]))
         # Multiplied, since prices differ by orders of magnitude between busy and quiet moments.
         short = np.clip((used - room) / np.maximum(room, 0.05 * float(room.mean()) + 1e-9), -1.0, 3.0)
         prices = prices * np.exp(0.5 / math.sqrt(1.0 + step) * short)
-    return best
+    return best, cheapest
 
 
 def _held(edges: Vector, begins: Vector, ends: Vector, memory_mb: Vector) -> Vector:

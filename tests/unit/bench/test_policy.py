@@ -84,6 +84,7 @@ def test_points_are_means_over_several_draws() -> None:
     cold = [each["curves"][DEFAULT][0]["cold_percent"] for each in (one, other, both)]
     assert cold[2] == pytest.approx((cold[0] + cold[1]) / 2, abs=0.001)
     possible = both["possible"]["1024"]
+    assert possible["bound"] >= possible["foresight"] > 0
     assert possible["bound"] >= possible[BY_NUMBER] > 0
     assert both["default_each_draw"] == one["default_each_draw"] + other["default_each_draw"]
 

@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Arrival, Image, Outcome, Trace, simulate
-from appliance.pool.simulator.clairvoyant import Belady, least_cold, least_cold_within
+from appliance.pool.simulator.clairvoyant import Belady, cold_with_foresight, least_cold, least_cold_within
 from appliance.pool.simulator.simulation import REMOTE_MS, WARM_MS
 from appliance.pool.simulator.traces import plain
 
@@ -106,6 +106,7 @@ def test_the_bound_within_a_budget_by_hand() -> None:
     """Room for one: while `b` runs `a` cannot be kept, so every start is cold; room for two: the first of each."""
     trace = trace_of((0.0, "a"), (10.0, "b"), (20.0, "a"), (30.0, "b"), duration_s=60.0)
     assert least_cold_within(trace, [1024, 2048, 1e9]) == [4, 2, 2]
+    assert cold_with_foresight(trace, [1024, 2048, 1e9]) == [4, 2, 2]
 
 
 @pytest.mark.parametrize("kind", ["poisson", "bursts", "timer"])
@@ -113,10 +114,14 @@ def test_no_policy_on_demand_beats_the_bound_within_its_budget(kind: str) -> Non
     """It holds for all that start on demand, crystal balls included, whatever the prices were moved to."""
     trace = plain(kind, images=8, duration_s=3600.0, rate=0.3)
     budgets = (1024, 2048, 4096)
-    for bound, rough, budget_mb in zip(
-        least_cold_within(trace, budgets), least_cold_within(trace, budgets, rounds=3), budgets, strict=True
+    for bound, rough, planned, budget_mb in zip(
+        least_cold_within(trace, budgets),
+        least_cold_within(trace, budgets, rounds=3),
+        cold_with_foresight(trace, budgets),
+        budgets,
+        strict=True,
     ):
-        assert rough <= bound
+        assert rough <= bound <= planned
         for eviction in ("lru", "greedy-dual"):
             settings = replace(BARE, memory_mb=budget_mb, eviction=eviction, idle_s=1e6)
             for make in (
