@@ -6,6 +6,7 @@ histogram of idle times a level says for the first, second, third … container 
 policies say for the only one.
 """
 
+import math
 from collections.abc import Mapping, Set
 
 from msgspec import Struct
@@ -19,6 +20,13 @@ FADE = 0.2
 """Weight of the newest in moving averages: about the last nine count."""
 
 
+SLOW_S = 3600.0
+"""The slow rate is a mean over about so long: what comes by chance at a steady rate is known by its long mean."""
+FIRST_GAP_S = 60.0
+"""What the time between two runs of a new image is taken for; it counts as much as one run that was seen."""
+SLOWEST_FADE = 0.02
+"""Weight of the newest in the slow mean of service times, once there are many."""
+LONGEST_S = 10 * 86_400.0
 LOST_S = 60.0
 """A run that arrived so long ago and has no container waits no longer."""
 
@@ -30,12 +38,17 @@ class DemandState(Struct, frozen=True, kw_only=True):
     service_s: float
     gap_s: float
     levels: tuple[dict[int, float], ...] = ()
+    slow: float = 0.0
+    watched_s: float = 0.0
+    slow_service_s: float = 0.0
+    """Of the slow rate and the slow mean of service times; 0 where an older version kept none."""
 
 
 class ImageDemand:
     """The demand for one image."""
 
-    __slots__ = ("_gap_s", "arrivals", "fell", "last", "levels", "runs", "service_s")
+    __slots__ = ("_counted", "_gap_s", "_served", "_slow", "_watched_s", "arrivals", "fell", "last", "levels", "runs",
+                 "service_s", "slow_service_s")  # fmt: skip
 
     def __init__(self) -> None:
         self.arrivals = 0
@@ -48,12 +61,24 @@ class ImageDemand:
         """When the number of runs last fell below each level."""
         self.levels: list[IdleTimes] = []
         self._gap_s = 0.0
+        self._slow = 0.0
+        """Arrivals but the first, each fading by exp(-age / SLOW_S), as of `_counted`."""
+        self._watched_s = 0.0
+        """The time since the first, fading like them."""
+        self._counted: float | None = None
+        self.slow_service_s = 1.0
+        self._served = 0
 
     def arrived(self, now: float) -> None:
         """Note a run that begins or wants to."""
         if self.arrivals:
             gap_s = max(0.0, now - self.last)
             self._gap_s = gap_s if self.arrivals == 1 else self._gap_s + FADE * (gap_s - self._gap_s)
+        if self._counted is None:
+            self._counted = now
+        else:
+            self._slow, self._watched_s = self._faded(now)
+            self._slow, self._counted = self._slow + 1.0, now
         self.arrivals += 1
         self.last = now
         self.runs += 1
@@ -68,6 +93,8 @@ class ImageDemand:
         """Note the end of a run."""
         if service_s > 0:
             self.service_s += FADE * (service_s - self.service_s)
+            self._served += 1
+            self.slow_service_s += max(1.0 / self._served, SLOWEST_FADE) * (service_s - self.slow_service_s)
         if 0 < self.runs <= MAX_LEVELS:
             self.fell[self.runs - 1] = now
         self.runs = max(0, self.runs - 1)
@@ -79,10 +106,29 @@ class ImageDemand:
         silence_s = now - self.last
         return self._gap_s + FADE * (silence_s - self._gap_s) if silence_s > self._gap_s else self._gap_s
 
+    def _faded(self, now: float) -> tuple[float, float]:
+        """Return arrivals and time watched as they count now."""
+        age_s = max(0.0, now - (self._counted if self._counted is not None else now))
+        part = math.exp(-age_s / SLOW_S)
+        return self._slow * part, self._watched_s * part + SLOW_S * (1.0 - part)
+
+    def slow_rate(self, now: float) -> float:
+        """Return the arrivals a second over the last hour or so."""
+        count, watched_s = self._faded(now)
+        return (count + 1.0) / (watched_s + FIRST_GAP_S)
+
     def state(self) -> DemandState:
         """Return what is known, to be kept."""
         levels = tuple(each.state() for each in self.levels)
-        return DemandState(arrivals=self.arrivals, service_s=self.service_s, gap_s=self._gap_s, levels=levels)
+        return DemandState(
+            arrivals=self.arrivals,
+            service_s=self.service_s,
+            gap_s=self._gap_s,
+            levels=levels,
+            slow=self._slow,
+            watched_s=self._watched_s,
+            slow_service_s=self.slow_service_s,
+        )
 
     @classmethod
     def restored(cls, state: DemandState, now: float) -> "ImageDemand":
@@ -92,6 +138,10 @@ class ImageDemand:
         made.last = now
         made.service_s = max(0.0, state.service_s)
         made._gap_s = max(0.0, state.gap_s)
+        made._slow, made._watched_s = max(0.0, state.slow), max(0.0, state.watched_s)
+        made._counted = now
+        made.slow_service_s = max(0.0, state.slow_service_s) or made.service_s
+        made._served = made.arrivals
         made.levels = [IdleTimes.restored(each) for each in state.levels[:MAX_LEVELS]]
         return made
 
@@ -103,6 +153,23 @@ class ImageDemand:
         """Return when a level was last wanted."""
         fell = self.fell[level - 1] if 0 < level <= MAX_LEVELS else None
         return otherwise if fell is None else fell
+
+
+def until_level_s(rate: float, service_s: float, runs: int, level: int) -> float:
+    """Return the mean time until `level` runs are there at once, with `runs` there now (fewer than `level`).
+
+    Of a queue with a server for each (M/M/infinity): the time from k to k + 1 runs is h_k = 1/r + k / (r s) h_(k-1), r
+    being the rate and s the service time (Keilson 1964). With one run each 10 s that takes 1 s, the second container is
+    wanted, from none in use, after 10 + (10 + 10 * 10) = 120 s, where the first is after 10 s.
+    """
+    step_s = total_s = 0.0
+    for count in range(level):
+        step_s = 1.0 / rate + count / (rate * max(service_s, 1e-3)) * step_s
+        if count >= runs:
+            total_s += step_s
+        if total_s > LONGEST_S:
+            return LONGEST_S
+    return total_s
 
 
 class Demand:

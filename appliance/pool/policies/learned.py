@@ -13,6 +13,7 @@ differ: whoever would have given up what was asked for first has lost.
 
 import math
 import operator
+import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -21,19 +22,20 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from appliance.pool.policies.demand import Demand
+from appliance.pool.policies.demand import LONGEST_S, Demand, until_level_s
 from appliance.pool.policies.facts import Idle
 from appliance.pool.policies.greedy_dual import GreedyDual
 
 Vector: TypeAlias = NDArray[np.float64]
 
-FEATURES = 10
+FEATURES = 11
 FORGET = 0.9995
 ENOUGH = 64
 """Uses it must have seen before it decides."""
 MAX_PENDING = 256
 SAMPLES = 4
-"""Predictions kept of one level."""
+"""Predictions kept of one level: of all moments since its last use, each with the same chance (Vitter 1985, algorithm
+R). The last four would all be of shortly before the next use, and everything would seem to return at once."""
 HORIZON_S = 6 * 3600.0
 """A use that has not come by then counts as one then."""
 TRUST = 0.05
@@ -53,6 +55,13 @@ class LearnedState(Struct, frozen=True, kw_only=True):
 class _Sample(Struct, frozen=True):
     at: float
     features: tuple[float, ...]
+
+
+class _Pending(Struct):
+    """Predictions of one level that wait for its next use, and how many there were."""
+
+    samples: list[_Sample]
+    seen: int = 0
 
 
 class _Duel(Struct, frozen=True):
@@ -85,12 +94,13 @@ class Learned:
         self._greedy = GreedyDual()
         self._weights: Vector = np.zeros(FEATURES)
         # Before anything is known: as long again as the expected gap and as it was idle, evenly.
-        self._weights[1] = self._weights[2] = 0.5
+        self._weights[1] = self._weights[2] = self._weights[10] = 1 / 3
         self._model: list[float] = self._weights.tolist()
         self._covariance: Vector = np.eye(FEATURES) * 10.0
         self._seen = 0
         self._balance = 0.0
-        self._pending: dict[tuple[str, int], deque[_Sample]] = {}
+        self._pending: dict[tuple[str, int], _Pending] = {}
+        self._dice = random.Random(0)  # noqa: S311 - which moments are kept, the same each time; no secret
         self._turn = 0
         self._duels: deque[_Duel] = deque(maxlen=MAX_PENDING)
         self._last: dict[str, tuple[float, float, tuple[str, int], tuple[float, ...]]] = {}
@@ -121,7 +131,8 @@ class Learned:
         """Learn from the predictions and duels that this run settles; to be told after the demand was."""
         demand = self._demand.images.get(image)
         level = demand.runs if demand is not None else 1
-        for sample in self._pending.pop((image, level), ()):
+        pending = self._pending.pop((image, level), None)
+        for sample in pending.samples if pending is not None else ():
             self._learn(np.array(sample.features), math.log(max(0.1, now - sample.at)))
         if self._duels:
             self._settle((image, level), now)
@@ -186,10 +197,11 @@ class Learned:
     def _features(self, idle: Idle, level: int, now: float) -> tuple[float, ...]:
         demand = self._demand.images.get(idle.image)
         idle_s = now - idle.since
-        gap_s = 86_400.0
+        lately_s = long_s = LONGEST_S
         usual_s = 0.0
         if demand is not None:
-            gap_s = demand.gap_s(now)
+            lately_s = until_level_s(1.0 / max(1e-3, demand.gap_s(now)), demand.service_s, demand.runs, level)
+            long_s = until_level_s(demand.slow_rate(now), demand.slow_service_s, demand.runs, level)
             idle_s = now - demand.idle_since(level, idle.since)
             times = demand.idle_times(level)
             usual_s = times.price_s(idle_s) if times is not None else 0.0
@@ -197,8 +209,8 @@ class Learned:
         turn = self._hour(now) * math.pi / 12
         return (
             1.0,
-            math.log(gap_s * level + 0.1),
-            math.log(usual_s + 0.1) if usual_s else math.log(gap_s * level + 0.1),
+            math.log(lately_s + 0.1),
+            math.log(usual_s + 0.1) if usual_s else math.log(long_s + 0.1),
             math.log(max(0.0, idle_s) + 1.0),
             1.0 if usual_s else 0.0,
             math.log(idle.cold_ms / 500.0),
@@ -206,15 +218,20 @@ class Learned:
             math.sin(turn),
             math.cos(turn),
             0.0 if hint_s is None else 5.0 - math.log(hint_s + 1.0),
+            math.log(long_s + 0.1),
         )
 
     def _remember(self, key: tuple[str, int], features: tuple[float, ...], now: float) -> None:
         """Keep a prediction's features until the use comes; one that takes too long counts as twice as long."""
-        samples = self._pending.pop(key, None) or deque[_Sample](maxlen=SAMPLES)
-        samples.append(_Sample(now, features))
-        self._pending[key] = samples  # the newest last
+        pending = self._pending.pop(key, None) or _Pending([])
+        pending.seen += 1
+        if len(pending.samples) < SAMPLES:
+            pending.samples.append(_Sample(now, features))
+        elif (at := self._dice.randrange(pending.seen)) < SAMPLES:
+            pending.samples[at] = _Sample(now, features)
+        self._pending[key] = pending  # the newest last
         if len(self._pending) > MAX_PENDING:
-            for sample in self._pending.pop(next(iter(self._pending))):
+            for sample in self._pending.pop(next(iter(self._pending))).samples:
                 self._learn(np.array(sample.features), math.log(max(0.1, 2 * (now - sample.at))))
 
     def _learn(self, x: Vector, y: float) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import PoolHint
-from appliance.pool.policies.demand import MAX_IMAGES, Demand
+from appliance.pool.policies.demand import LONGEST_S, MAX_IMAGES, Demand, until_level_s
 from appliance.pool.policies.forecaster import Level
 from appliance.pool.policies.hints import MAX_HINTS, OPERATOR, PlanHints
 from appliance.pool.policies.histogram import Histogram
@@ -190,3 +190,31 @@ def test_demand_forgets_the_oldest_image_and_lost_runs() -> None:
     demand.settle({"i511"}, 1000.0)
     assert demand.images["i511"].runs == 1
     assert demand.images["i510"].runs == 0
+
+
+def test_when_the_next_level_is_wanted() -> None:
+    """The worked example: the first after a gap, the second after many, sooner while one is in use."""
+    assert until_level_s(0.1, 1.0, 0, 1) == pytest.approx(10.0)
+    assert until_level_s(0.1, 1.0, 0, 2) == pytest.approx(120.0)
+    assert until_level_s(0.1, 1.0, 1, 2) == pytest.approx(110.0)
+
+
+@given(st.floats(1e-6, 100.0), st.floats(0.0, 1000.0), st.integers(0, 15), st.integers(1, 15))
+def test_a_higher_level_is_wanted_later(rate: float, service_s: float, runs: int, more: int) -> None:
+    """It takes a gap at least, longer for a higher level, and is bounded whatever the numbers are."""
+    times = [until_level_s(rate, service_s, runs, runs + each) for each in range(1, more + 1)]
+    assert times == sorted(times)
+    assert min(1.0 / rate, LONGEST_S) <= times[0] * (1 + 1e-9)
+    assert times[-1] <= LONGEST_S
+
+
+def test_the_slow_rate_forgets_slowly() -> None:
+    """A new image is taken for one of a run a minute; what came steadily for hours is known; a silence lowers it."""
+    demand = Demand()
+    demand.arrived("a", 0.0)
+    assert demand.images["a"].slow_rate(0.0) == pytest.approx(1 / 60)
+    for number in range(1, 2000):
+        demand.arrived("a", 10.0 * number)
+    known = demand.images["a"].slow_rate(19_990.0)
+    assert known == pytest.approx(0.1, rel=0.02)
+    assert 0.3 * known < demand.images["a"].slow_rate(19_990.0 + 3600.0) < 0.4 * known

@@ -26,12 +26,15 @@ def live(policy: Learned, demand: Demand, gaps_s: dict[str, float], until_s: flo
     since = dict.fromkeys(gaps_s, 0.0)
     arrivals = []
     for image, gap_s in gaps_s.items():
-        at = 0.0
+        at = rng.expovariate(1 / gap_s)
         while at < until_s:
-            at += rng.expovariate(1 / gap_s)
             arrivals.append((at, image))
+            at += rng.expovariate(1 / gap_s)
+    before = 0.0
     for at, image in sorted(arrivals):
-        policy.observed([container(each, since[each]) for each in gaps_s], at - 0.01)
+        # At any moment: just before an arrival, what mostly arrives would seem to return at once.
+        policy.observed([container(each, since[each]) for each in gaps_s], rng.uniform(before, at))
+        before = at
         demand.arrived(image, at)
         policy.arrived(image, at)
         demand.ended(image, 0.5, at + 0.5)
@@ -44,8 +47,7 @@ def test_it_learns_who_returns_soon() -> None:
     demand = Demand()
     policy = learned(demand)
     gaps_s = {"often": 10.0, "seldom": 100.0, "rare": 1000.0}
-    idle = live(policy, demand, gaps_s, 8000.0)
-    now = max(each.since for each in idle) + 1.0
+    idle, now = live(policy, demand, gaps_s, 8000.0), 8001.0
     assert policy.decides
     waits = [policy.wait_s(each, 1, now) for each in idle]
     for wait_s, gap_s in zip(waits, gaps_s.values(), strict=True):
