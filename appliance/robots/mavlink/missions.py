@@ -229,18 +229,22 @@ class Missions:
         if not vehicle.armed:
             await craft.mode(craft.modes.guided)
             await craft.arm()
-        await self._set_current(max(1, first))
+        # A vehicle that flies this very mission is told no item: it may have passed it by the time it hears of it, and
+        # would fly back and do a second time what is done there.
+        flying = first > 0 and vehicle.custom_mode == craft.modes.numbers[craft.modes.mission]
+        again = first > 0 and not flying and await self._begins_anew()
+        if not flying:
+            await self._set_current(max(1, first))
         if first == 0:
             vehicle.forget_mission()
         try:
             # Said again right behind the mode, where entering it begins anew: whatever is done at the items before
             # would be done twice until an answer came.
-            again = first > 0 and await self._begins_anew()
             behind = command_long(vehicle, dialect.SET_CURRENT, float(first)) if again else None
             await craft.mode(craft.modes.mission, behind=behind)
             # ArduPilot denies a first or last item here.
             await command(vehicle, dialect.MISSION_START, 0, 0, patience=craft.patience, check=craft.check_control)
-            if first > 0:
+            if first > 0 and not flying:
                 await self._stay_at(first)
         except RobotFailure:
             # The mode may have been taken up all the same: it must not fly what nobody watches.

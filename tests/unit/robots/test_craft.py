@@ -424,6 +424,23 @@ async def test_a_mission_is_gone_on_with_by_an_autopilot_that_begins_anew(flown:
     assert flown.craft.distance((30.0, 0.0, 5.0)) < 3.0
 
 
+@pytest.mark.parametrize("anew", [True, False])
+async def test_a_mission_that_is_flown_all_the_while_is_told_no_item(flown: Flown, anew: bool) -> None:
+    """The gateway was restarted, the vehicle flew on: nothing is said that could bring it back to what it has passed."""
+    steps = (MissionStep(0.0, 30.0, 5.0, act="photo"), MissionStep(30.0, 30.0, 5.0, act="photo"))
+    missions = Missions(flown.craft)
+    await flown.arm()
+    flown.sim.parameters.values["MIS_RESTART"] = float(anew)
+    flying = asyncio.create_task(missions.mission(MissionArgs(steps=steps)))
+    assert await flown.craft.confirm(lambda: flown.sim.at == 5 and flown.vehicle.airborne, within_s=20.0)
+    await _give_up(flying)
+    flown.sent.clear()
+    done = await missions.mission(MissionArgs(steps=steps))
+    assert done.result["resumed_at"] >= 5
+    assert not flown.commands(dialect.SET_CURRENT)
+    assert flown.sim.pictures == 2
+
+
 async def test_a_start_names_no_items(flown: Flown) -> None:
     """ArduPilot denies a start that names a first or last item: the mission flies since none is named."""
     await flown.arm()
