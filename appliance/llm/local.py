@@ -7,6 +7,7 @@ between two instructions; if it does not pass, nothing has changed.
 
 import asyncio
 import contextlib
+import time
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -41,9 +42,9 @@ _NO_PLAN = {
     "unclear": "it does not say what to do, or with what",
     "language": "only English is understood",
 }
-_UNSOUND = 0.5
-"""How sure it can be of a plan that breaks a rule of plans: another tier is asked, or an operator. Of held-out
-instructions no such plan was right, but a program reads the rules more strictly than people do."""
+_UNSOUND = 0.8
+"""Times `local_min_confidence`: how sure it can be of a plan that breaks a rule of plans, so that another tier or an
+operator is asked. Of held-out instructions no such plan was right; yet a program reads the rules strictly."""
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (
@@ -270,18 +271,22 @@ class LocalTier:
         question = Question(
             text=context.instruction, robots=robots, skills=self._shapes, deadline_s=self._config.local_deadline_s
         )
-        likeliest: Proposal | None = None
+        began = time.monotonic()
+        proposals = self._read(await self._asked(process, question), context, process)
+        likeliest = proposals[0]
         # What breaks a rule of plans was not meant; the next likely answer that breaks none was. Where all do, others
-        # are looked for once.
-        for thorough in (False, True):
-            said = await self._asked(process, msgspec.structs.replace(question, thorough=thorough))
-            proposals = self._read(said, context, process)
-            likeliest = likeliest or proposals[0]
-            for each in proposals:
-                if not self._unsound(each.plan, context):
-                    return each
+        # are looked for once, in the time that is left.
+        left_s = question.deadline_s - (time.monotonic() - began)
+        if all(self._unsound(each.plan, context) for each in proposals) and left_s > 0:
+            thorough = msgspec.structs.replace(question, thorough=True, deadline_s=left_s)
+            with contextlib.suppress(PlanError, DeadlineError, UnreachableError):
+                proposals = self._read(await self._asked(process, thorough), context, process)
+        sound = next((each for each in proposals if not self._unsound(each.plan, context)), None)
+        if sound is not None:
+            return sound
         # With its problems, for whoever repairs or refuses it, and at most for an operator to look at.
-        return msgspec.structs.replace(likeliest, confidence=min(likeliest.confidence, _UNSOUND))
+        most = _UNSOUND * self._config.local_min_confidence
+        return msgspec.structs.replace(likeliest, confidence=min(likeliest.confidence, most))
 
     async def _asked(self, process: ModelProcess, question: Question) -> Said:
         said = _said(await process.exchange({"question": msgspec.to_builtins(question)}))

@@ -9,6 +9,7 @@ a confidence.
 """
 
 import heapq
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -27,7 +28,7 @@ CARD = "planner.json"
 MOST_SYMBOLS = 600
 """Of an answer; a longer one is none."""
 SAID = 1.0
-"""What each word that an answer points at is worth, in nats: chosen on a third of the held-out instructions."""
+"""What each word that an answer points at is worth, in nats; chosen on held-out pairs (docs/planner.md)."""
 TURNS, THOROUGH = 4, 12
 """Answers that are tried besides the one that is likeliest step by step; each takes half an answer's time or so."""
 MOST_OF = 0.5
@@ -173,9 +174,9 @@ class Speaker:
         spoken = len(first.symbols)
         left = longer * spoken
         # The cheapest turns first, of whatever answer; the number keeps equal ones in the order they were found in.
-        turns = [(turn.cost, number, turn, first) for number, turn in enumerate(first.turns) if turn.share >= fair]
+        number = itertools.count()
+        turns = [(turn.cost, next(number), turn, first) for turn in first.turns if turn.share >= fair]
         heapq.heapify(turns)
-        found = len(turns)
         while turns and len(paths) <= turns_most and left > 0:
             _, _, turn, trunk = heapq.heappop(turns)
             other = guide()
@@ -196,8 +197,7 @@ class Speaker:
             left -= len(begun.symbols) - turn.at
             for each in begun.turns:
                 if each.share >= fair:
-                    found += 1
-                    heapq.heappush(turns, (each.cost, found, each, begun))
+                    heapq.heappush(turns, (each.cost, next(number), each, begun))
         paths.sort(key=lambda path: path.cost - SAID * covered(path.symbols, words))
         return Said(
             symbols=tuple(paths[0].symbols),

@@ -32,7 +32,7 @@ from transformers import LlamaForCausalLM
 from appliance.errors import ConflictError
 from appliance.llm.train.batches import Batch, Groups
 from appliance.llm.train.corpus import corpus_examples
-from appliance.llm.train.ending import ended
+from appliance.llm.train.ending import Stopping, ended
 from appliance.llm.train.examples import Example
 from appliance.llm.train.forward import AnswerLoss
 from appliance.llm.train.judge import judge
@@ -162,14 +162,15 @@ class Trainer:
 
     def run(self, *, minutes: float = math.inf, look_every: int = 500) -> dict[str, Any]:
         """Train until the recipe's steps are done or the time is over; return the last figures."""
-        try:
-            return self._run(minutes, look_every)
-        except KeyboardInterrupt:
-            self.save()
+        stopping = Stopping()
+        with stopping:
+            figures = self._run(minutes, look_every, stopping)
+        if stopping.asked:
             self._progress(f"stopped after step {self._step:,}; run it again to go on")
-            raise
+            raise KeyboardInterrupt
+        return figures
 
-    def _run(self, minutes: float, look_every: int) -> dict[str, Any]:
+    def _run(self, minutes: float, look_every: int, stopping: Stopping) -> dict[str, Any]:
         until = time.monotonic() + 60 * minutes
         parameters = sum(each.numel() for each in self._model.parameters())
         self._progress(f"{parameters / 1e6:.1f} M parameters, {len(self._examples):,} pairs, on {self._device}")
@@ -195,9 +196,11 @@ class Trainer:
             if self._step % look_every == 0:
                 self.save()
                 self._look(200)
-            if now > until:
+            if now > until or stopping.asked:
                 break
         self.save()
+        if stopping.asked:
+            return {}
         figures = self._look(100_000)
         (self._folder / "figures.json").write_text(json.dumps(figures, indent=1))
         return figures

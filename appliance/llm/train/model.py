@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from transformers import LlamaConfig, LlamaForCausalLM
 
-from appliance.errors import NotFoundError
+from appliance.errors import ConflictError, NotFoundError
 from appliance.llm.embedded import folder_of
 from appliance.llm.train.batches import CONTEXT
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
@@ -108,8 +108,11 @@ class Base:
                 mean = state[name].mean(dim=0, keepdim=True)
                 state[name] = torch.cat([state[name], mean.expand(tokens.size - len(state[name]), -1)])
         new_model(recipe, tokens).load_state_dict(state)  # it fits, or says what does not
-        folder.mkdir(parents=True, exist_ok=False)
+        if folder.exists():
+            raise ConflictError(f"{folder} is there already", remedy="name another folder, or remove that one")
+        folder.mkdir(parents=True)
         tokens.save(folder)
-        (folder / RECIPE).write_text(json.dumps(asdict(recipe), indent=1))
         begun = {"optimisers": [], "step": 0, "group": 0, "inside": 0, "steps": recipe.steps, "cooling": False}
         torch.save({"model": state, **begun}, folder / CHECKPOINT)
+        # Last: a folder with a recipe is a run to go on with, and one without weights would begin at random.
+        (folder / RECIPE).write_text(json.dumps(asdict(recipe), indent=1))

@@ -46,6 +46,7 @@ _PHRASES: dict[str, list[str]] = tomllib.loads(Path(__file__).with_name("phrases
 _WHOEVER = frozenset(
     {"robot", "robots", "drone", "drones", "bot", "bots", "unit", "units", "machine", "machines", "arm", "arms"}
     | {"somebody", "someone", "anyone", "anybody", "whoever", "whichever", "everyone", "everybody", "another", "other"}
+    | {"whoever's", "either", "each", "nearest", "closest", "free", "idle"}
 )
 _LEADS = frozenset(
     {"then", "after", "afterwards", "next", "finally", "and", "once", "when", "meanwhile"}

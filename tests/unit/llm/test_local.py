@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.errors import PlanError
+from appliance.errors import DeadlineError, PlanError
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
@@ -32,7 +32,7 @@ class Model:
     folder = "/models/fake"
     speaks = True
 
-    def __init__(self, answers: Answers, thorough: Answers | None = None) -> None:
+    def __init__(self, answers: Answers, thorough: Answers | Exception | None = None) -> None:
         self._answers = {False: answers, True: thorough or answers}
         self.asked: list[bool] = []
 
@@ -42,7 +42,10 @@ class Model:
     async def exchange(self, order: dict[str, Any]) -> dict[str, Any]:
         """Answer."""
         self.asked.append(order["question"]["thorough"])
-        (symbols, confidence), *others = self._answers[self.asked[-1]]
+        answers = self._answers[self.asked[-1]]
+        if isinstance(answers, Exception):
+            raise answers
+        (symbols, confidence), *others = answers
         return {
             "symbols": symbols,
             "confidence": confidence,
@@ -52,11 +55,11 @@ class Model:
         }
 
 
-async def proposed(model: Model, context: PlanContext = CONTEXT) -> Proposal:
-    """Return what the tier proposes."""
-    tier = LocalTier(LlmConfig(local_model=Model.folder), CATALOGUE)
+async def proposed(model: Model, *, least: float = 0.6) -> Proposal:
+    """Return what the tier proposes where it must be so sure at least."""
+    tier = LocalTier(LlmConfig(local_model=Model.folder, local_min_confidence=least), CATALOGUE)
     tier._process = model  # pyright: ignore[reportAttributeAccessIssue]
-    return await tier.propose(context)
+    return await tier.propose(CONTEXT)
 
 
 async def asked(*answers: tuple[list[str], float]) -> tuple[dict[str, object], float]:
@@ -73,7 +76,7 @@ async def test_the_likeliest_answer_that_breaks_no_rule_is_taken() -> None:
 
 async def test_when_all_break_a_rule_the_likeliest_is_told() -> None:
     """Its problems are what repair and refusal go by; nobody is sure of it, whatever the model says."""
-    assert await asked((NOWHERE, 0.8), (UNREADABLE, 0.1), (NOWHERE, 0.05)) == ({}, 0.5)
+    assert await asked((NOWHERE, 0.8), (UNREADABLE, 0.1), (NOWHERE, 0.05)) == ({}, pytest.approx(0.48))
 
 
 async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
@@ -85,6 +88,20 @@ async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
     proposal = await proposed(model)
     assert (proposal.plan.subtasks[0].params, proposal.confidence) == ({"place": "dock 3"}, 0.02)
     assert model.asked == [False, True]
+
+
+async def test_the_plan_there_is_outlives_a_second_look_that_fails() -> None:
+    """Late, a refusal, no plan at all: the likeliest of the first answers is what is told."""
+    for thorough in ([(REFUSED, 0.9)], [(UNREADABLE, 0.9)], DeadlineError("no answer within 1 s")):
+        model = Model([(NOWHERE, 0.8)], thorough=thorough)
+        assert (await proposed(model)).plan.subtasks[0].params == {}
+        assert model.asked == [False, True]
+
+
+async def test_no_threshold_lets_a_plan_through_that_breaks_a_rule() -> None:
+    """However low a site sets `llm.local_min_confidence`, it is below it."""
+    model = Model([(NOWHERE, 0.8)])
+    assert (await proposed(model, least=0.2)).confidence < 0.2
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,10 @@ from appliance.llm.train.weights import read_weights, unpacked
 
 
 def test_the_embedded_planner_gives_its_weights_back() -> None:
-    """All weights of its shape are there, and its rounded output matrix is its tied embedding, but for the rounding."""
+    """All weights of its shape are there under their names, with the keys and values where the library keeps them.
+
+    Queries and keys are turned by position and values are not: the rows of the one matrix are compared in their order.
+    """
     shape, weights = read_weights(FOLDER)
     inside = {name for name in weights if name.startswith("model.layers.0.")}
     assert len(weights) == len(inside) * shape.layers + 3
@@ -24,6 +27,12 @@ def test_the_embedded_planner_gives_its_weights_back() -> None:
         shape.width,
     )
     assert weights["model.layers.0.mlp.down_proj.weight"].shape == (shape.width, shape.inner)
+    model = onnx.load(FOLDER / "model.onnx")  # pyright: ignore[reportUnknownMemberType]
+    stored = {each.name: numpy_helper.to_array(each) for each in model.graph.initializer}
+    packed = stored["model.layers.0.attn.qkv_proj.MatMul.weight_Q8"].astype(np.int16) - 128
+    whole = (packed * stored["model.layers.0.attn.qkv_proj.MatMul.weight_scales"][..., None]).reshape(len(packed), -1)
+    parts = [weights[f"model.layers.0.self_attn.{one}_proj.weight"] for one in "qkv"]
+    assert np.array_equal(np.concatenate(parts), whole.astype(np.float32))
     assert weights["lm_head.weight"] is weights["model.embed_tokens.weight"]
 
 
