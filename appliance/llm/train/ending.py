@@ -29,7 +29,7 @@ class Stopping:
 
     def __init__(self) -> None:
         self.asked = False
-        self._before: dict[int, signal._HANDLER] = {}
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
         """Take the signals."""
