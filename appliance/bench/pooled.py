@@ -4,7 +4,7 @@ import secrets
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Collection
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -95,8 +95,8 @@ async def pool(
 ) -> AsyncGenerator[Pool]:
     """A pool of its own fleet, with a skill that does nothing, gone afterwards."""
 
-    async def nobody(need: Need) -> list[Candidate]:
-        del need
+    async def nobody(need: Need, avoid: Collection[str]) -> list[Candidate]:
+        del need, avoid
         return []
 
     async def nothing(call: Call) -> dict[str, Any]:

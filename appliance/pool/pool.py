@@ -13,7 +13,7 @@ Guarantees:
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ class Pool:
         run_dir: folder for the containers' sockets.
         catalogue: skills and images.
         site: the map that handlers get.
-        find_remote: offers of other gateways for a need.
+        find_remote: offers of other gateways for a need; told too whose will not be used.
         facts: what selection must know of the fleet for a need: where state is, what moving bytes costs.
         on_call: carries out what a handler asks of the appliance.
         on_change: told the facts of all containers whenever one of them changes.
@@ -78,7 +78,7 @@ class Pool:
         run_dir: Path,
         catalogue: Catalogue,
         site: Site,
-        find_remote: Callable[[Need], Awaitable[list[Candidate]]],
+        find_remote: Callable[[Need, Collection[str]], Awaitable[list[Candidate]]],
         facts: Callable[[Need], Facts] = lambda _: Facts(),
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
@@ -222,7 +222,7 @@ class Pool:
             # Not held while others are asked: a container that another run could use must not wait for that.
             try:
                 async with asyncio.timeout(self._config.remote_timeout_s):
-                    offers = await self._find_remote(need)
+                    offers = await self._find_remote(need, facts.avoid)
             except (TimeoutError, SwiftbotError) as error:
                 log.info("other gateways could not be asked", reason=str(error) or "too slow")
             decision = self._choose(need, offers, facts)

@@ -59,7 +59,7 @@ class Choosing:
                 return explained(decision, avoid)
             self._check(request)
             gateway = decision.gateway
-            remote.promise(gateway)
+            sent = remote.promise(gateway)
             try:
                 accepted = await self._plane.rpc.call(
                     gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
@@ -69,11 +69,11 @@ class Choosing:
                 raise UnreachableError(f"{gateway} did not say whether it runs {request.run_id}") from error
             except SwiftbotError as error:
                 # The container was taken, or was never there, or its gateway went away meanwhile.
-                remote.turned_out(gateway, good=False)
+                remote.turned_out(sent, good=False)
                 avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}
                 self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
             else:
-                remote.turned_out(gateway, good=True)
+                remote.turned_out(sent, good=True)
                 return passed_on(accepted, explained(decision, avoid))
         raise PoolError("a selection without other gateways chose one")
 

@@ -25,7 +25,7 @@ from appliance.model import ContainerInfo, GatewayStatus, Need, RunRequest
 from appliance.plane.node import Plane
 from appliance.pool.pool import Pool
 from appliance.pool.turns import Turn
-from appliance.tasks.remote import RemoteContainers
+from appliance.tasks.remote import RemoteContainers, Sent
 
 log = structlog.get_logger(__name__)
 
@@ -140,6 +140,8 @@ class Elsewhere:
         self._tries: dict[str, _Tries] = {}
         self._offers: dict[str, Offer] = {}
         """Where the runs that were withdrawn are to go; taken from here by whoever passes them on."""
+        self._promised: dict[str, Sent] = {}
+        """The same runs, where a container that was ready was promised."""
         self._under_way: set[str] = set()
         self._anew: dict[str, float] = {}
         """Gateway -> until when it is not sent another run to be started anew."""
@@ -221,7 +223,7 @@ class Elsewhere:
         if offer.anew:
             self._anew[offer.gateway] = now + ANEW_S
         else:
-            self._remote.promise(offer.gateway)
+            self._promised[run_id] = self._remote.promise(offer.gateway)
 
     def offer_of(self, run_id: str) -> Offer:
         """Where a run that was withdrawn is to go."""
@@ -230,6 +232,7 @@ class Elsewhere:
     def forget(self, run_id: str) -> None:
         """Note that a run is not in progress here any more: it may have ended at the moment it was withdrawn."""
         self._offers.pop(run_id, None)
+        self._promised.pop(run_id, None)
         self._under_way.discard(run_id)
 
     def offered(self, run_id: str, *, taken: bool, container: str = "") -> None:
@@ -240,10 +243,10 @@ class Elsewhere:
             taken: whether the other gateway has it.
             container: the one that it got there.
         """
-        offer = self._offers.pop(run_id)
+        del self._offers[run_id]
         self._under_way.discard(run_id)
-        if not offer.anew:
-            self._remote.turned_out(offer.gateway, good=taken, container=container)
+        if (sent := self._promised.pop(run_id, None)) is not None:
+            self._remote.turned_out(sent, good=taken, container=container)
         if taken:
             self._tries.pop(run_id, None)
             self._remote.searches["moved"] += 1

@@ -14,7 +14,7 @@ import asyncio
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Protocol
 
 from msgspec import Struct
@@ -83,9 +83,10 @@ class _Trust(Struct):
     until: float = 0.0
 
 
-class _Sent(Struct):
+class Sent(Struct):
     """A run that was sent to a gateway. It holds one of its ready containers until that one is told of anew."""
 
+    gateway: str
     until: float
     runs: dict[str, int]
     """Container -> how many runs it had had, of those that were ready there when it was sent."""
@@ -108,7 +109,7 @@ class RemoteContainers:
         self._links = links
         self._round_trip_ms: dict[str, float] = {}
         self._trust: dict[str, _Trust] = {}
-        self._sent: dict[str, list[_Sent]] = {}
+        self._sent: dict[str, list[Sent]] = {}
         """Gateway -> the runs that were sent to it of late."""
         self._doubted: dict[str, float] = {}
         """Gateway -> until when what is known of its containers is not believed: it had none when it was asked."""
@@ -116,17 +117,23 @@ class RemoteContainers:
         """For GatewayStatus.searches."""
         plane.on_member_lost.append(self._forget)
 
-    async def find(self, need: Need) -> list[Candidate]:
-        """Containers on other gateways that could serve a need, in any state, each with its round trip."""
+    async def find(self, need: Need, avoid: Collection[str] = ()) -> list[Candidate]:
+        """Containers on other gateways that could serve a need, in any state, each with its round trip.
+
+        Args:
+            need: T = (image, cpu, mem, volumes).
+            avoid: gateways whose containers will not be used: what they have is told, and ends no search.
+        """
         here = self._plane.gateway
         self._plane.registry.asked(need.image)
         near = [each for each in self._plane.ring.successors(f"image/{need.image}", self._successors) if each != here]
         found = {(each.gateway, each.id): each for each in self._known(need)}
-        asked = [] if self.ready(need) else [each for each in near if not self._is_fresh(each) or self._sent_to(each)]
+        enough = any(each.gateway not in avoid for each in self.ready(need))
+        asked = [] if enough else [each for each in near if not self._is_fresh(each) or self._sent_to(each)]
         self.searches["saved"] += len(near) - len(asked)
         self.searches["asked"] += len(asked)
         taken = {(each.gateway, each.id) for each in self._promised_ones(found.values())}
-        for gateway, containers in (await self._ask_all(asked, need)).items():
+        for gateway, containers in (await self._ask_all(asked, need, avoid)).items():
             # Whoever answers has counted in what was sent to it: short runs are over before anything was told.
             taken = {key for key in taken if key[0] != gateway}
             # What a gateway says of its own containers is newer than what was heard of them.
@@ -188,11 +195,11 @@ class RemoteContainers:
             found += left[: sum(not each.container for each in sent)]
         return found
 
-    def _open(self, gateway: str) -> list[_Sent]:
+    def _open(self, gateway: str) -> list[Sent]:
         """The runs that were sent to a gateway and of which it has not told yet."""
         now, known = time.monotonic(), self._plane.registry.containers.get(gateway, {})
 
-        def untold(sent: _Sent) -> bool:
+        def untold(sent: Sent) -> bool:
             container = known.get(sent.container)
             return not sent.container or (
                 container is not None
@@ -206,15 +213,21 @@ class RemoteContainers:
         """Whether a run was sent to it so lately that it has not told of it yet."""
         return bool(self._open(gateway))
 
-    def promise(self, gateway: str) -> None:
-        """Note that a run is being sent to a gateway: one of its ready containers is spoken for."""
+    def promise(self, gateway: str) -> Sent:
+        """Note that a run is being sent to a gateway: one of its ready containers is spoken for.
+
+        What is returned tells `turned_out` which of the runs that were sent there its answer is about.
+        """
         known = self._plane.registry.containers.get(gateway, {})
         runs = {each.id: each.runs for each in known.values() if each.state is ContainerState.READY}
-        sent = self._open(gateway)[-MOST_PROMISED:]
-        self._sent[gateway] = [*sent, _Sent(until=time.monotonic() + PROMISED_S, runs=runs)]
+        sent = Sent(gateway=gateway, until=time.monotonic() + PROMISED_S, runs=runs)
+        self._sent[gateway] = [*self._open(gateway)[-MOST_PROMISED:], sent]
+        return sent
 
-    async def _ask_all(self, gateways: Sequence[str], need: Need) -> dict[str, tuple[ContainerInfo, ...]]:
-        """Ask at the same time; once one offers all that is needed, the rest is not waited for to the end."""
+    async def _ask_all(
+        self, gateways: Sequence[str], need: Need, avoid: Collection[str]
+    ) -> dict[str, tuple[ContainerInfo, ...]]:
+        """Ask at the same time; once one that may be used offers all that is needed, the rest is not waited for."""
         began = time.monotonic()
         asking = {asyncio.create_task(self._ask(each, need), name=f"ask {each}"): each for each in gateways}
         answers: dict[str, tuple[ContainerInfo, ...]] = {}
@@ -229,7 +242,9 @@ class RemoteContainers:
                     if containers is None:
                         continue
                     answers[gateway] = containers
-                    if until == math.inf and any(_is_all(one, need) and one.gateway == gateway for one in containers):
+                    if until < math.inf or gateway in avoid:
+                        continue
+                    if any(_is_all(one, need) and one.gateway == gateway for one in containers):
                         took_s = time.monotonic() - began
                         until = began + max(PATIENCE * took_s, took_s + LEAST_PATIENCE_S)
         finally:
@@ -309,17 +324,17 @@ class RemoteContainers:
         }
 
     def turned_out(
-        self, gateway: str, *, good: bool, container: str = "", now: Callable[[], float] = time.monotonic
+        self, sent: Sent, *, good: bool, container: str = "", now: Callable[[], float] = time.monotonic
     ) -> None:
         """Note whether a container that a gateway offered was there, and which one the run that was sent there got."""
-        sent = next((each for each in self._sent.get(gateway, ()) if not each.container), None)
-        if sent is not None and good:
-            sent.container = container
-        elif sent is not None:
-            self._sent[gateway].remove(sent)
+        gateway = sent.gateway
         if good:
+            sent.container = container
             self._trust.pop(gateway, None)
             return
+        # An answer that took long may be about a run that is not counted any more; those sent since are not meant.
+        if gateway in self._sent:
+            self._sent[gateway] = [each for each in self._sent[gateway] if each is not sent]
         self._doubted[gateway] = time.monotonic() + PROMISED_S
         trust = self._trust.setdefault(gateway, _Trust())
         trust.empty += 1

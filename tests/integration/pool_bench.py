@@ -3,6 +3,7 @@
 import asyncio
 import secrets
 import textwrap
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ class Bench:
     async def pool(self, *, gateway: str = "g1", fleet: str = "", **settings: Any) -> Pool:
         """Return a started pool."""
 
-        async def nobody(need: Need) -> list[Candidate]:
+        async def nobody(need: Need, avoid: Collection[str]) -> list[Candidate]:
             return []
 
         async def answer(call: Call) -> dict[str, Any]:

@@ -117,7 +117,7 @@ from appliance.pool.pool import Pool
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
 async def main():
-    async def none(x): return []
+    async def none(*_): return []
     pool = Pool(PoolConfig(floor={{"base": 2}}, capacity=2, mode="local"), gateway="g1", fleet={bench.fleet!r},
         run_dir=Path({str(bench.folder / "run" / bench.fleet / "g1")!r}),
         catalogue=load_catalogue([Path({str(bench.folder / "skills")!r})]),

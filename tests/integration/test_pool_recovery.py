@@ -49,7 +49,7 @@ from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
 
 async def main(fleet, folder, moment, delay_s):
-    async def none(x): return []
+    async def none(*_): return []
     floor = {"base": 4 if moment == "start" else 2}
     pool = Pool(PoolConfig(floor=floor, capacity=4, starts_at_once=4, mode="local"), gateway="g1", fleet=fleet,
         run_dir=Path(folder) / "run" / fleet / "g1", catalogue=load_catalogue([Path(folder) / "skills"]),

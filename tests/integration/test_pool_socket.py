@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import secrets
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,7 @@ async def test_warm_containers_serve_on_while_podman_is_away(
 ) -> None:
     """A dead API socket is told with its remedy, runs in warm containers go on, and a new socket is taken up."""
 
-    async def nobody(need: Need) -> list[Candidate]:
+    async def nobody(need: Need, avoid: Collection[str]) -> list[Candidate]:
         return []
 
     async def nothing(call: Call) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import textwrap
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -356,6 +356,7 @@ class Bench:
         self.changes: list[tuple[ContainerInfo, ...]] = []
         self.calls: list[Call] = []
         self.offers: list[Candidate] = []
+        self.avoided: list[set[str]] = []
         self.memory = Reading()
 
     async def answer(self, call: Call) -> dict[str, Any]:
@@ -373,8 +374,9 @@ class Bench:
             case _:
                 return {"number": call.number}
 
-    async def find_remote(self, need: Need) -> list[Candidate]:
-        """Offer what the test has put there for this image."""
+    async def find_remote(self, need: Need, avoid: Collection[str]) -> list[Candidate]:
+        """Offer what the test has put there for this image, and note whose will not be used."""
+        self.avoided.append(set(avoid))
         return [each for each in self.offers if each.container.image == need.image]
 
     async def pool(self, *, gateway: str = "g1", fleet: str = "f1", state: State = ALONE, **settings: Any) -> Pool:

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,8 @@ async def test_remote(bench: Any) -> None:
     decision = await pool.select(need, allow_remote=True)
     assert (decision.phase, decision.gateway, decision.container) == (Phase.REMOTE_WARM, "g2", "far")
     assert (await pool.select(need, allow_remote=False)).phase is Phase.COLD
+    assert (await pool.select(need, allow_remote=True, avoid={"g2": "left out"})).phase is Phase.COLD
+    assert bench.avoided == [set(), {"g2"}], "whoever looks is told whose offers do not count"
     with pytest.raises(RefusedError, match="g2"):
         await pool.run(bench.request(), decision, lambda _: None)
 
@@ -164,11 +167,11 @@ async def test_others_that_do_not_answer(bench: Any) -> None:
     """Gateways that are slow to offer, or cannot be asked, only mean a cold start."""
     pool = await bench.pool(mode="federated", remote_timeout_s=0.05)
 
-    async def slow(need: Need) -> list[Candidate]:
+    async def slow(need: Need, avoid: Collection[str]) -> list[Candidate]:
         await asyncio.sleep(60)
         return []
 
-    async def broken(need: Need) -> list[Candidate]:
+    async def broken(need: Need, avoid: Collection[str]) -> list[Candidate]:
         raise SwiftbotError("no network")
 
     for ask in (slow, broken):

@@ -28,8 +28,9 @@ def container(gateway: str, name: str, state: ContainerState = READY, **fields: 
 
 
 @pytest.fixture
-def remote(plane: Any) -> RemoteContainers:
+def remote(plane: Any, monkeypatch: pytest.MonkeyPatch) -> RemoteContainers:
     """Return what gw-1 knows of gw-2, gw-3 (asked) and gw-4 (heard of)."""
+    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", 3600.0)  # or a slow machine is too late to see a promise
     plane.present = {"gw-1", "gw-2", "gw-3", "gw-4"}
     return RemoteContainers(plane, successors=3, links=UnmeasuredLinks())
 
@@ -49,9 +50,9 @@ def answers(plane: Any, **by_gateway: tuple[ContainerInfo, ...]) -> None:
     plane.rpc.on["find_containers"] = find
 
 
-async def found(remote: RemoteContainers) -> dict[str, ContainerState]:
+async def found(remote: RemoteContainers, avoid: tuple[str, ...] = ()) -> dict[str, ContainerState]:
     """Look, and return what was found, by id."""
-    return {each.container.id: each.container.state for each in await remote.find(NEED)}
+    return {each.container.id: each.container.state for each in await remote.find(NEED, avoid)}
 
 
 async def test_a_gateways_own_word_is_newer_than_what_was_heard(remote: RemoteContainers, plane: Any) -> None:
@@ -106,13 +107,13 @@ async def test_empty_offers_leave_a_gateway_out_for_a_while(remote: RemoteContai
     """The clock is passed in; a good offer, and the gateway's going, end it."""
     now = 100.0
     for _ in range(EMPTY_OFFERS - 1):
-        remote.turned_out("gw-2", good=False, now=lambda: now)
+        remote.turned_out(remote.promise("gw-2"), good=False, now=lambda: now)
     assert remote.left_out(lambda: now) == {}
-    remote.turned_out("gw-2", good=False, now=lambda: now)
+    remote.turned_out(remote.promise("gw-2"), good=False, now=lambda: now)
     assert set(remote.left_out(lambda: now)) == {"gw-2"}
     assert remote.left_out(lambda: now + FIRST_LEFT_OUT_S) == {}
     for _ in range(20):  # one that goes on offering nothing is left out for longer and longer, up to a bound
-        remote.turned_out("gw-2", good=False, now=lambda: now)
+        remote.turned_out(remote.promise("gw-2"), good=False, now=lambda: now)
     assert set(remote.left_out(lambda: now + LEFT_OUT_S - 0.1)) == {"gw-2"}
     assert remote.left_out(lambda: now + LEFT_OUT_S) == {}
     for callback in plane.on_member_lost:
@@ -142,13 +143,35 @@ async def test_a_container_that_a_run_was_just_sent_to_is_not_offered_to_the_nex
     answers(plane, gw_2=(container("gw-2", "b"),), gw_3=())
     plane.registry.ages = {"gw-2": 0.1, "gw-3": 0.1}
     assert {each.id for each in remote.ready(NEED)} == {"a", "b"}
-    remote.promise("gw-2")
+    sent = remote.promise("gw-2")
     assert {each.id for each in remote.ready(NEED)} == {"b"}
     assert await found(remote) == {"b": READY}
-    remote.turned_out("gw-2", good=False)
+    remote.turned_out(sent, good=False)
     assert remote.ready(NEED) == []
     assert set(await found(remote)) == {"b"}
     assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-2"]
+
+
+async def test_what_a_gateway_has_that_may_not_be_used_ends_no_search(
+    remote: RemoteContainers, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither what is known of it saves asking, nor its answer, the first, waiting for one that can be used."""
+    monkeypatch.setattr("appliance.tasks.remote.PATIENCE", 0.0)
+    monkeypatch.setattr("appliance.tasks.remote.LEAST_PATIENCE_S", 0.0)
+    know(plane, container("gw-4", "known"))
+    plane.registry.ages = {"gw-4": 0.1}
+    whole = {"cpu": 8.0, "memory_mb": 8192, "volumes": NEED.volumes}
+
+    async def find(gateway: str, need: Need) -> ContainerList:
+        if gateway == "gw-3":
+            for _ in range(20):  # a search that ends with the other's answer has ended by then
+                await asyncio.sleep(0)
+        return ContainerList(containers=(container(gateway, f"of {gateway}", **whole),))
+
+    plane.rpc.on["find_containers"] = find
+    assert await found(remote) == {"known": READY}
+    assert await found(remote, avoid=("gw-2", "gw-4")) == {"known": READY, "of gw-2": READY, "of gw-3": READY}
+    assert await found(remote, avoid=("gw-4",)) == {"known": READY, "of gw-2": READY}, "that one ends it"
 
 
 async def test_short_runs_one_after_the_other_find_the_same_container(remote: RemoteContainers, plane: Any) -> None:
@@ -167,13 +190,12 @@ async def test_a_run_holds_its_container_until_that_one_is_told_of(remote: Remot
     """Once it is known which one a run got, the others are counted on, and it too as soon as it is told of anew."""
     know(plane, container("gw-2", "a", runs=3), container("gw-2", "b"))
     plane.registry.ages = {"gw-2": 0.1}
-    remote.promise("gw-2")
+    sent = remote.promise("gw-2")
     assert {each.id for each in remote.ready(NEED)} == {"b"}
-    remote.turned_out("gw-2", good=True, container="b")
+    remote.turned_out(sent, good=True, container="b")
     assert {each.id for each in remote.ready(NEED)} == {"a"}
     know(plane, container("gw-2", "b", BUSY))
-    remote.promise("gw-2")
-    remote.turned_out("gw-2", good=True, container="a")
+    remote.turned_out(remote.promise("gw-2"), good=True, container="a")
     assert remote.ready(NEED) == []
     know(plane, container("gw-2", "a", runs=4))  # so short that it was never told to be busy
     assert {each.id for each in remote.ready(NEED)} == {"a"}
@@ -183,9 +205,27 @@ async def test_an_offer_that_came_to_nothing_holds_no_container(remote: RemoteCo
     """A run that was refused has none: when its gateway is believed again, all that are ready there count."""
     know(plane, container("gw-2", "a"))
     plane.registry.ages = {"gw-2": 0.1}
-    remote.promise("gw-2")
-    remote.turned_out("gw-2", good=False)
+    remote.turned_out(remote.promise("gw-2"), good=False)
     assert not remote._open("gw-2")
+
+
+async def test_an_answer_that_took_long_is_not_taken_for_another_runs(
+    remote: RemoteContainers, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A refusal frees what the refused run held, and a container is that of the run that got it, in whatever order."""
+    know(plane, container("gw-2", "a"), container("gw-2", "b"), container("gw-2", "c"))
+    plane.registry.ages = {"gw-2": 0.1}
+    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", -1.0)
+    slow = [remote.promise("gw-2"), remote.promise("gw-2")]
+    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", 3600.0)
+    later = remote.promise("gw-2")
+    remote.turned_out(slow[0], good=True, container="c")
+    assert {each.id for each in remote.ready(NEED)} == {"b", "c"}, "whose answer is still to come holds one"
+    remote.turned_out(slow[1], good=False)
+    assert remote._open("gw-2") == [later]
+    remote.turned_out(later, good=True, container="a")
+    remote._doubted.clear()
+    assert {each.id for each in remote.ready(NEED)} == {"b", "c"}
 
 
 async def test_the_slowest_is_not_waited_for_when_another_has_all_that_is_needed(
