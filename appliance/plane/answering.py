@@ -50,24 +50,25 @@ class Answering:
         command. `query` writes down for whom it is; what other Zenoh clients ask says nothing of it.
         """
         limit, running, name = self._wire.config.max_payload_bytes, set[asyncio.Task[None]](), self._wire.name(expr)
+        door = None if "*" in expr else expr.encode()
 
         def take(query: zenoh.Query) -> None:
-            key, payload = str(query.key_expr), query.payload
+            payload = query.payload
             size = len(payload) if payload is not None else 0
             direct, meant = link.read_mark(query)
-            if meant and "*" not in expr and meant != expr.encode():
+            if meant and door is not None and meant != door:
                 error = UnreachableError(f"{expr}: {link.WRONG_DOOR}", remedy="ask again in a moment")
                 begin = partial(self._misrouted, name, query, expr, link.asker_of(query), error)
                 size = 0
             elif size > limit:
-                error = PayloadError(f"{key}: {size:,} bytes", remedy=f"at most {limit:,}")
+                error = PayloadError(f"{query.key_expr}: {size:,} bytes", remedy=f"at most {limit:,}")
                 begin = partial(self._refuse_query, f"oversize {name}", query, expr, error)
                 size = 0
             else:
                 data = payload.to_bytes() if payload is not None else b""
                 if at_once is not None and direct and at_once(data, partial(link.reply_direct, query, expr)):
                     return
-                begin = partial(answer, key, data, query)
+                begin = partial(answer, str(query.key_expr), data, query)
             if not self._wire.inbox.post(begin, size):
                 link.reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
 

@@ -107,13 +107,18 @@ class Asking:
         direct: bool = False,
         meant: bytes | None = None,
     ) -> None:
+        first = target != zenoh.QueryTarget.ALL
         limit = self._wire.config.max_payload_bytes
         if len(payload) > limit:
             raise PayloadError(f"a request of {len(payload):,} bytes on {expr}", remedy=f"at most {limit:,}")
         if self._wire.closed:
             raise UnreachableError("the session is closed")
 
+        answered = False
+
         def take(reply: zenoh.Reply) -> None:
+            nonlocal answered
+            answered = True
             sample = reply.ok
             if sample is None:
                 error = link.error_of(reply.err)
@@ -127,14 +132,20 @@ class Asking:
                 self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
             else:
                 data = sample.payload.to_bytes()
-                self._wire.inbox.post(partial(on_reply, str(sample.key_expr), data, None), size, must=True)
+                key = expr if first else str(sample.key_expr)
+                self._wire.inbox.post(partial(on_reply, key, data, None), size, must=True)
+
+        def end() -> None:
+            # Where the first answer is all that counts, waking the event loop for the end after it is for nothing.
+            if not (first and answered):
+                self._wire.inbox.post(on_end, must=True)
 
         priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
         control = zenoh.CongestionControl
         send = partial(
             self._wire.raw.get,
             expr,
-            zenoh.handlers.Callback(take, drop=partial(self._wire.inbox.post, on_end, must=True), indirect=False),
+            zenoh.handlers.Callback(take, drop=end, indirect=False),
             target=target,
             consolidation=zenoh.ConsolidationMode.NONE,
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.

@@ -21,6 +21,7 @@ _MOST_RECENT = 8
 _LOCK = threading.Lock()
 
 
+@lru_cache(maxsize=4096)
 def position(text: str) -> int:
     """Where a text lies on the ring: its SHA-1 as a number in [0, 2**160)."""
     return int.from_bytes(hashlib.sha1(text.encode(), usedforsecurity=False).digest(), "big")
