@@ -70,13 +70,16 @@ class Plane:
         self._membership = _membership(config, session, self.rpc, gateway)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
-        self._outlived = Outlived(
-            self._pulse,
-            lease_s=config.lease_ms / 1e3,
-            members=self._membership,
-            answers=self._answers,
-            renew=session.renew_links,
-        )
+        self._outlived: Outlived | None = None
+        # A bounded view changes all the time: who is new in it does not tell that others noticed a standstill.
+        if config.view == "full":
+            self._outlived = Outlived(
+                self._pulse,
+                lease_s=config.lease_ms / 1e3,
+                members=self._membership,
+                answers=self._answers,
+                renew=session.renew_links,
+            )
         self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self._forgetting = Forgetting(self._voting, gateway=gateway, store=store, kept_hours=config.tombstone_hours)
         self.dht = Dht(
@@ -260,7 +263,8 @@ class Plane:
 
     async def close(self) -> None:
         """Leave the fleet and close the store; more than once does no harm."""
-        await self._outlived.close()
+        if self._outlived is not None:
+            await self._outlived.close()
         await self._membership.leave()
         self._membership.close()
         await self._reconciler.close()

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import structlog
 
-from appliance.plane.pulse import Pulse, clock
+from appliance.plane.pulse import Pulse, Standstill, clock
 
 log = structlog.get_logger(__name__)
 
@@ -79,22 +79,22 @@ class Outlived:
         self._not_before = 0.0
         pulse.on_stalled.append(self._on_stalled)
 
-    def _on_stalled(self) -> None:
-        since, lasted_s = self._pulse.last_standstill
+    def _on_stalled(self, standstill: Standstill) -> None:
         # After less than a lease the others may not have closed their links at all.
-        if lasted_s < self._lease_s or self._now() < self._not_before:
+        if standstill.lasted_s < self._lease_s or self._now() < self._not_before:
             return
         self._not_before = self._now() + REST_S
-        self._looking = asyncio.create_task(self._look(since), name="links after a standstill")
+        self._looking = asyncio.create_task(self._look(standstill.since), name="links after a standstill")
 
     async def _look(self, since: float) -> None:
         await self._pause(self._lease_s * PAUSE_LEASES)
-        kept = sorted(self._members.seen_since(since))[:MOST_ASKED]
+        kept = sorted(self._members.seen_since(since))
         noticed = len(self._members.members) - 1 > len(kept)
         if not kept or (not noticed and len(kept) > 1):
             return
-        answered = await asyncio.gather(*(self._answers(each, self._lease_s * ANSWER_LEASES) for each in kept))
-        silent = [name for name, well in zip(kept, answered, strict=True) if not well]
+        asked = kept[:MOST_ASKED]
+        answered = await asyncio.gather(*(self._answers(each, self._lease_s * ANSWER_LEASES) for each in asked))
+        silent = [name for name, well in zip(asked, answered, strict=True) if not well]
         # One that has gone meanwhile has no link any more.
         silent = [name for name in silent if name in self._members.seen_since(since)]
         if silent:
@@ -102,7 +102,9 @@ class Outlived:
             self._renew("they outlived a standstill")
 
     async def close(self) -> None:
-        """Look no more."""
+        """Look no more, whatever the pulse tells until it is closed too; more than once does no harm."""
+        if self._on_stalled in self._pulse.on_stalled:
+            self._pulse.on_stalled.remove(self._on_stalled)
         if self._looking is not None:
             self._looking.cancel()
             await asyncio.gather(self._looking, return_exceptions=True)

@@ -34,16 +34,14 @@ class Pulse:
     """Beats on a thread of its own: what only holds up the event loop makes nobody take this gateway for dead."""
 
     def __init__(self, lease_s: float, *, clock: Callable[[], float] = clock) -> None:
-        self.on_stalled: list[Callable[[], None]] = []
-        """Called on the event loop after the process stood still."""
+        self.on_stalled: list[Callable[[Standstill], None]] = []
+        """Called on the event loop after the process stood still, once for each standstill and told which."""
         self._lease_s = lease_s
         self._clock = clock
         self._lock = threading.Lock()
         self._last = clock()
         self._until = self._last
         self._stalls = 0
-        self.last_standstill = Standstill(self._last, 0.0)
-        """The one that `on_stalled` was told of last."""
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -80,18 +78,17 @@ class Pulse:
             if stalled:
                 self._until = now + self._lease_s
                 self._stalls += 1
-                self.last_standstill = Standstill(since, stood_s)
         if stalled:
             log.warning("this process stood still; it may have been succeeded", seconds=round(stood_s, 3))
             # The loop may be gone when the process ends without closing: then nobody listens.
             with contextlib.suppress(RuntimeError):
                 if self._loop is not None:
-                    self._loop.call_soon_threadsafe(self._tell)
+                    self._loop.call_soon_threadsafe(self._tell, Standstill(since, stood_s))
         return now
 
-    def _tell(self) -> None:
+    def _tell(self, standstill: Standstill) -> None:
         for callback in tuple(self.on_stalled):
-            callback()
+            callback(standstill)
 
     def close(self) -> None:
         """Beat no more."""

@@ -19,7 +19,7 @@ from appliance.plane.comparing import ASK_S, Comparing
 from appliance.plane.dht import Dht
 from appliance.plane.handover import HandOver
 from appliance.plane.membership import Membership
-from appliance.plane.pulse import Pulse
+from appliance.plane.pulse import Pulse, Standstill
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.steps import FEW, Kind, Settled, Step, Steps
@@ -106,7 +106,7 @@ class Reconciler:
         self._changed.set()
         self._hurry.set()
 
-    def _on_stalled(self) -> None:
+    def _on_stalled(self, _: Standstill) -> None:
         self._changed.set()
         self._hurry.set()
 

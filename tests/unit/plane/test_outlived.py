@@ -3,15 +3,18 @@
 import asyncio
 from collections.abc import Callable
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 
 from appliance.plane.comparing import SEE_S
 from appliance.plane.keys import Keys
 from appliance.plane.membership import Membership
-from appliance.plane.outlived import REST_S, Outlived
+from appliance.plane.node import Plane
+from appliance.plane.outlived import MOST_ASKED, REST_S, Outlived
 from appliance.plane.pulse import Pulse, Standstill
 from appliance.plane.reconcile import LOSS_ASK_S
+from appliance.plane.settings import PlaneConfig
 
 pytestmark = pytest.mark.anyio
 LEASE_S = 1.0
@@ -21,8 +24,7 @@ class Bench:
     """A pulse and a membership in the test's hands; `after` happens in each pause."""
 
     def __init__(self, *tokens: tuple[str, float]) -> None:
-        self.on_stalled: list[Callable[[], None]] = []
-        self.last_standstill = Standstill(0.0, 0.0)
+        self.on_stalled: list[Callable[[Standstill], None]] = []
         self.tokens = dict(tokens)
         self.answering: set[str] = set()
         self.asked: list[str] = []
@@ -65,9 +67,9 @@ class Bench:
 
     async def stand_still(self, since: float, lasted_s: float) -> None:
         """Stand still, and wait until all is looked at."""
-        self.last_standstill, self.now = Standstill(since, lasted_s), since + lasted_s
-        for tell in self.on_stalled:
-            tell()
+        self.now = since + lasted_s
+        for tell in tuple(self.on_stalled):
+            tell(Standstill(since, lasted_s))
         others = asyncio.all_tasks() - {cast("Any", asyncio.current_task())}
         await asyncio.gather(*(each for each in others if each.get_name() == "links after a standstill"))
 
@@ -130,6 +132,34 @@ async def test_one_that_answers_or_has_gone_meanwhile_is_well() -> None:
     bench.on_stalled = bench.on_stalled[1:]
     await bench.stand_still(10.0, 1.1)
     assert (bench.asked, bench.renewed) == (["gw-3", "gw-4"], [])
+
+
+async def test_a_large_fleet_is_counted_whole() -> None:
+    """Only so many are asked, but with 40 that nobody lost one that is slow breaks no link; with one lost it does."""
+    bench = Bench(*((f"gw-{number:02}", 5.0) for number in range(2, 42)))
+    bench.answering = set(bench.tokens) - {"gw-07"}
+    await bench.stand_still(10.0, 1.1)
+    assert (bench.asked, bench.renewed) == ([], [])
+    bench.tokens["gw-03"] = 99.0
+    await bench.stand_still(98.0, 1.1)
+    assert (len(bench.asked), len(bench.renewed)) == (MOST_ASKED, 1)
+
+
+async def test_nothing_is_looked_at_after_the_end() -> None:
+    """The pulse is closed last: a standstill meanwhile begins no look, and closing twice does no harm."""
+    bench = Bench(("gw-2", 5.0))
+    await bench.outlived.close()
+    await bench.outlived.close()
+    await bench.stand_still(10.0, 1.1)
+    assert (bench.pauses, bench.asked, bench.renewed) == ([], [], [])
+
+
+@pytest.mark.parametrize(("view", "looks"), [("full", True), (64, False)])
+async def test_only_where_all_are_known_it_is_looked_at(view: Any, looks: bool) -> None:
+    """A bounded view changes without anybody having noticed anything, and does not know since when tokens are there."""
+    plane = Plane(PlaneConfig(view=view), session=MagicMock(), store=MagicMock(), gateway="gw-1")
+    owners = [getattr(each, "__self__", None) for each in plane._pulse.on_stalled]
+    assert any(isinstance(each, Outlived) for each in owners) is looks
 
 
 async def test_it_is_not_done_again_at_once() -> None:

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from appliance.plane.pulse import Pulse
+from appliance.plane.pulse import Pulse, Standstill
 
 pytestmark = pytest.mark.anyio
 
@@ -24,7 +24,7 @@ async def test_standing_still_is_noticed_by_whoever_looks_first() -> None:
     """Three quarters of a lease without a beat put a gateway in doubt for a lease, and its listeners hear of it."""
     clock, told = Clock(), asyncio.Event()
     pulse = Pulse(1.0, clock=clock)
-    pulse.on_stalled.append(told.set)
+    pulse.on_stalled.append(lambda _: told.set())
     pulse.start()
     try:
         for _ in range(8):
@@ -42,6 +42,29 @@ async def test_standing_still_is_noticed_by_whoever_looks_first() -> None:
         assert pulse.stalls == 1
     finally:
         pulse.close()
+
+
+async def test_each_standstill_is_told_as_what_it_was() -> None:
+    """A second, shorter one before the event loop gets its turn does not hide the first."""
+    clock, both = Clock(), asyncio.Event()
+    told: list[Standstill] = []
+
+    def take(standstill: Standstill) -> None:
+        told.append(standstill)
+        if len(told) == 2:
+            both.set()
+
+    pulse = Pulse(1.0, clock=clock)
+    pulse.on_stalled.append(take)
+    pulse.start()
+    try:
+        for seconds in (5.0, 0.75):
+            clock.now += seconds
+            assert pulse.doubtful
+        await both.wait()
+    finally:
+        pulse.close()
+    assert told == [(100.0, 5.0), (105.0, 0.75)]
 
 
 async def test_time_before_the_start_and_after_the_end_counts_for_nothing() -> None:
