@@ -3,7 +3,8 @@
 A killed process is noticed by its connections, at once; a frozen one (SIGSTOP, a machine that hangs) by its silence,
 after `plane.lease_ms`. Survivors say in their logs when they lost it, and the successor when the record is written by
 which it drives the task: a client that was linked to the lost one hears nothing at just that moment. In the end each
-task must have succeeded, and each subtask must have ended exactly once.
+task must have succeeded, each subtask must have ended exactly once, and where two coordinators have told of one end
+both must have the same record once they have met.
 """
 
 import asyncio
@@ -11,7 +12,7 @@ import signal
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,9 +29,12 @@ from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
+from appliance.tasks.api import TaskAsk
 from appliance.tasks.machine import Transition, TransitionKind
 
 STEP_S = 120.0
+MEET_S = 10.0
+"""For how long two coordinators that have both told of a run's end may still have different records of its task."""
 GOAL_MS = 1000.0
 _PARAMETER = """
 retries = 5
@@ -61,7 +65,7 @@ class Heard:
     """
 
     def __init__(self, clients: Sequence[FleetClient]) -> None:
-        self._ended: dict[tuple[str, str], dict[int, set[str]]] = {}
+        self._ended: dict[tuple[str, str], dict[int, set[tuple[str, int]]]] = {}
         """Task and subtask -> attempts that succeeded -> who has told so, as which transition of the record."""
         self._closers = [
             client.plane.session.subscribe_typed(client.plane.session.keys.transition(), Transition, self._take)
@@ -76,7 +80,7 @@ class Heard:
         """Take note of a transition; the same one may come from several clients."""
         if told.kind is TransitionKind.SUCCEEDED:
             attempts = self._ended.setdefault((told.task, told.subtask), {})
-            attempts.setdefault(told.attempt, set()).add(f"{told.coordinator} #{told.sequence}")
+            attempts.setdefault(told.attempt, set()).add((told.coordinator, told.sequence))
 
     def run_twice(self, tasks: Sequence[str]) -> list[str]:
         """The subtasks of these tasks of which more than one attempt has succeeded, with who told so."""
@@ -89,16 +93,63 @@ class Heard:
     def told_twice(self, tasks: Sequence[str]) -> list[str]:
         """Those of which one attempt's end was written by two coordinators: they did not see each other."""
         return [
-            f"{task}/{subtask} attempt {attempt}: {', '.join(sorted(who))}"
+            f"{task}/{subtask} attempt {attempt}: {', '.join(f'{name} #{number}' for name, number in sorted(who))}"
             for (task, subtask), attempts in self._ended.items()
             for attempt, who in attempts.items()
             if task in tasks and len(who) > 1
         ]
 
+    def tellers(self, tasks: Sequence[str]) -> dict[str, set[str]]:
+        """The tasks of which one attempt's end was written by two coordinators, with these."""
+        found: dict[str, set[str]] = {}
+        for (task, _), attempts in self._ended.items():
+            for who in attempts.values():
+                if task in tasks and len(who) > 1:
+                    found.setdefault(task, set()).update(name for name, _ in who)
+        return found
+
     def close(self) -> None:
         """Listen no more."""
         for closer in self._closers:
             closer.close()
+
+
+async def apart(
+    tellers: Mapping[str, Collection[str]],
+    read: Callable[[str, str], Awaitable[TaskRecord]],
+    *,
+    tries: int = round(MEET_S / LOOK_S),
+    pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
+) -> list[str]:
+    """Read tasks' records from all their coordinators; returns those that stay different, or cannot be read, and how.
+
+    Args:
+        tellers: task -> the coordinators that have told of it.
+        read: a task's record as a gateway has it: gateway, task.
+        tries: how often they are read before that is taken as it is.
+        pause: waits so many seconds between two tries.
+    """
+    wrong: list[str] = []
+    for task, gateways in tellers.items():
+        problem = ""
+        for _ in range(tries):
+            problem = await _difference(sorted(gateways), task, read)
+            if not problem:
+                break
+            await pause(LOOK_S)
+        if problem:
+            wrong.append(f"{task} has no one record: {problem}")
+    return wrong
+
+
+async def _difference(gateways: Sequence[str], task: str, read: Callable[[str, str], Awaitable[TaskRecord]]) -> str:
+    try:
+        records = {name: await read(name, task) for name in gateways}
+    except SwiftbotError as error:
+        return str(error)
+    if all(each == records[gateways[0]] for each in records.values()):
+        return ""
+    return ", ".join(f"{name} {each.state} #{each.sequence} of {each.coordinator}" for name, each in records.items())
 
 
 class Adoption(Struct, frozen=True, kw_only=True):
@@ -227,6 +278,7 @@ class _Rounds:
             if how == "kill":
                 self._arena.start(victim)
             await self._arena.settled(self._client, ready=0)
+            problems += await apart(heard.tellers(names), self._record)
         heard.close()
         return {
             "rounds": rounds,
@@ -239,6 +291,10 @@ class _Rounds:
             "adopted_after_detection": summary(adopted),
             "parts": {part: summary(took_ms) for part, took_ms in parts.items()},
         }
+
+    async def _record(self, gateway: str, task: str) -> TaskRecord:
+        """A task's record as a gateway has it."""
+        return await self._client.plane.rpc.call(gateway, "task", TaskAsk(id=task), TaskRecord)
 
     async def _submit(self, prefix: str) -> list[str]:
         steps = (

@@ -4,10 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from appliance.bench.failover.logs import LogTail, wall_s
-from appliance.bench.failover.takeover import Heard, adoptions
-from appliance.errors import DeadlineError
+from appliance.bench.failover.takeover import Heard, adoptions, apart
+from appliance.errors import DeadlineError, UnreachableError
+from appliance.model import TaskRecord, TaskState
 from appliance.tasks.machine import Transition, TransitionKind
 
 pytestmark = pytest.mark.anyio
@@ -80,3 +82,31 @@ def test_a_run_that_two_coordinators_tell_of_is_one_run() -> None:
     assert [each.split()[0] for each in heard.run_twice(tasks)] == ["t-3/s1"]
     assert heard.told_twice(tasks) == ["t-2/s1 attempt 1: gw-1 #5, gw-2 #6"]
     assert heard.run_twice(tasks[:2]) == heard.told_twice(tasks[:1]) == []
+    assert (heard.tellers(tasks), heard.tellers(tasks[:1])) == ({"t-2": {"gw-1", "gw-2"}}, {})
+
+
+async def test_two_coordinators_must_have_one_record_in_the_end() -> None:
+    """They may take a moment to agree; records that stay different, or cannot be read, are told with who has what."""
+    done = TaskRecord(id="t", instruction="i", state=TaskState.SUCCEEDED, coordinator="gw-1", sequence=7)
+    behind = replace(done, coordinator="gw-2", sequence=6)
+    has: dict[tuple[str, str], TaskRecord] = {
+        ("gw-1", "late"): done, ("gw-2", "late"): behind, ("gw-1", "split"): done, ("gw-2", "split"): behind,
+        ("gw-1", "lost"): done,
+    }  # fmt: skip
+    pauses: list[float] = []
+
+    async def read(gateway: str, task: str) -> TaskRecord:
+        if (gateway, task) not in has:
+            raise UnreachableError("no answer")
+        return has[gateway, task]
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        has["gw-2", "late"] = done
+
+    both = {"gw-2", "gw-1"}
+    assert await apart({"late": both}, read, tries=3, pause=pause) == []
+    assert len(pauses) == 1
+    split, lost = await apart({"late": both, "split": both, "lost": both}, read, tries=3, pause=pause)
+    assert split == "split has no one record: gw-1 succeeded #7 of gw-1, gw-2 succeeded #6 of gw-2"
+    assert lost == "lost has no one record: no answer"
