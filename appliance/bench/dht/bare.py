@@ -38,7 +38,12 @@ async def _ask(session: zenoh.Session, key: str, payload: bytes) -> None:
     answered: asyncio.Future[None] = loop.create_future()
 
     def take(_: zenoh.Reply) -> None:
-        loop.call_soon_threadsafe(answered.set_result, None)
+        loop.call_soon_threadsafe(settle)
+
+    def settle() -> None:
+        # A second answer, or one that comes when nobody waits any more, is none.
+        if not answered.done():
+            answered.set_result(None)
 
     session.get(
         key,

@@ -10,8 +10,9 @@ bounds no policy that starts ahead: with perfect foresight that needs neither co
 `least_cold_within` has that bound on the memory at each moment: what the runs leave of the budget. Which idle times
 fit is then a packing, too hard to solve exactly; its Lagrangian dual bounds it from the safe side, whatever the prices
 are (Fisher 1981): with a price for a megabyte at each moment, every idle time is kept that costs less than the cold
-start it saves, and what was not sold of the memory is paid for. The prices are moved until that bound is low. Runs that
-have to wait because those before them fill the budget are taken as if they did not.
+start it saves, and what was not sold of the memory is paid for. The prices are moved until that bound is low. Both
+bounds hold where runs do not wait: those that have to, because those before them fill the budget, are taken as if they
+did not, though a run that waited may begin warm in what the one before it has left.
 
 `cold_with_foresight` is no bound but a plan that somebody who knew all arrivals could have made: idle times are kept,
 those first that are cheapest at the prices of that bound, as long as there is room at each moment. What is best lies
@@ -92,7 +93,10 @@ def least_cold(trace: Trace, wasted_mb_s: Sequence[float]) -> list[int]:
 
 
 def least_cold_within(trace: Trace, budgets_mb: Sequence[float], *, rounds: int = ROUNDS) -> list[int]:
-    """Return a bound below which no policy on demand gets with such memory for all containers, on one gateway."""
+    """Return a bound on the cold starts of every policy on demand with such memory for all containers, on one gateway.
+
+    It holds where no run has to wait for another.
+    """
     levels = _levels(trace)
     bounds: list[int] = []
     for budget_mb in budgets_mb:
