@@ -18,7 +18,7 @@ class FakeSession:
         self.answers = answers
         self.answer: Callable[[Any], object] = print
 
-    def get(self, key: str, handler: Callable[[Any], object], **_: object) -> None:
+    def get(self, key: str, handler: Callable[[Any], object], **_options: object) -> None:
         """Ask."""
         self.answer = handler
         for _ in range(self.answers):
