@@ -426,7 +426,7 @@ async def test_a_mission_is_gone_on_with_by_an_autopilot_that_begins_anew(flown:
 
 @pytest.mark.parametrize("anew", [True, False])
 async def test_a_mission_that_is_flown_all_the_while_is_told_no_item(flown: Flown, anew: bool) -> None:
-    """The gateway was restarted, the vehicle flew on: nothing is said that could bring it back to what it has passed."""
+    """A gateway was restarted, the vehicle flew on: nothing is said that could bring it back to what it has passed."""
     steps = (MissionStep(0.0, 30.0, 5.0, act="photo"), MissionStep(30.0, 30.0, 5.0, act="photo"))
     missions = Missions(flown.craft)
     await flown.arm()
