@@ -23,6 +23,9 @@ from appliance.robots.verbs import (
 
 _SOFT_M = 1.0
 """How far a robot on its way may be in a forbidden area: what GPS errs and braking takes."""
+_CLOSE_S = 0.55
+"""Two positions told within so long are joined by a straight line: those of 2 Hz with what their times vary, or of 5 Hz
+with one lost."""
 
 
 def check_way(site: Site, start: Pose, goto: GotoArgs, *, flies: bool) -> tuple[Waypoint, ...]:
@@ -161,14 +164,17 @@ def check_velocity(site: Site, start: Pose, move: VelocityArgs, *, flies: bool) 
     return east, north, move.up_mps
 
 
-def breach(site: Site, pose: Pose, *, flies: bool, before: Pose | None = None, margin_m: float = 3.0) -> str:
+def breach(
+    site: Site, pose: Pose, *, flies: bool, before: Pose | None = None, apart_s: float = 0.0, margin_m: float = 3.0
+) -> str:
     """Return in words how a robot that moves has left what the site allows, empty when it has not.
 
     Args:
         site: whose fence, areas and limits hold.
         pose: where it is.
         flies: whether it has an altitude.
-        before: where it was when it was looked at last: between two looks it may pass right through a narrow area.
+        before: where it said that it was last: between two reports it may pass right through a narrow area.
+        apart_s: the time between the two; what it flew in a longer one is not known, and the position alone counts.
         margin_m: what GPS and braking need: a robot that grazes the edge is not stopped for it.
     """
     if site.fence is not None and not inside(site.fence, pose.x, pose.y, margin_m):
@@ -179,6 +185,16 @@ def breach(site: Site, pose: Pose, *, flies: bool, before: Pose | None = None, m
     for box in site.forbidden:
         if inside(core(box, rim), pose.x, pose.y):
             return f"it is in {box.name}"
-        if before is not None and crosses(box, (before.x, before.y), (pose.x, pose.y), rim):
+        if before is not None and apart_s <= _CLOSE_S and _went_through(box, before, pose, rim):
             return f"it went through {box.name}"
     return ""
+
+
+def _went_through(box: Box, before: Pose, pose: Pose, rim_m: float) -> bool:
+    """Tell whether the line between two positions goes deeper into an area than that of a way round its corner.
+
+    Where a way along two edges has the corner half-way, a line of length L comes L / (2 * sqrt 2) from both edges, and
+    less deep with the corner elsewhere. A narrow area keeps its middle whatever the rim (`core`).
+    """
+    length = math.hypot(pose.x - before.x, pose.y - before.y)
+    return crosses(box, (before.x, before.y), (pose.x, pose.y), rim_m + length / (2.0 * math.sqrt(2.0)))

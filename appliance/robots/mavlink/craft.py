@@ -19,6 +19,7 @@ from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Message, make
 from appliance.robots.mavlink.modes import Modes
 from appliance.robots.mavlink.protocol import Patience, ask, command
+from appliance.robots.mavlink.track import Report, apart_s
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.policy import breach
 from appliance.robots.settings import RobotsConfig
@@ -185,8 +186,7 @@ class Craft:
         found = [f"its estimator has {each}" for each in vehicle.condition.estimator]
         if vehicle.condition.failsafe:
             found.append(f"failsafe: {vehicle.condition.failsafe}")
-        pose = vehicle.pose
-        left = "" if pose is None else breach(self.site, pose, flies=vehicle.flies)
+        left = self._breach()
         return [*found, left] if left else found
 
     async def confirm(self, holds: Callable[[], bool], within_s: float = CONFIRM_S) -> bool:
@@ -257,15 +257,15 @@ class Craft:
         vehicle = self.vehicle
         loop = asyncio.get_running_loop()
         best, since = left(), loop.time()
-        here = vehicle.pose
+        seen = vehicle.track.count
         outside = self._breach()
         while not there():
             await asyncio.sleep(POLL_S)
             if there():
                 return
             now, distance = loop.time(), left()
-            before, here = here, vehicle.pose
-            await self._check_way(verb, mode, before, outside=outside, safe=safe)
+            told, seen = vehicle.track.since(seen), vehicle.track.count
+            await self._check_way(verb, mode, told, outside=outside, safe=safe)
             if distance < best - _NEARER_M or steady():
                 best, since = min(best, distance), now
             elif now - since > self.config.stall_s:
@@ -278,7 +278,7 @@ class Craft:
                     retryable=True,
                 )
 
-    async def _check_way(self, verb: str, mode: str, before: Pose | None, *, outside: str, safe: bool) -> None:
+    async def _check_way(self, verb: str, mode: str, told: Sequence[Report], *, outside: str, safe: bool) -> None:
         vehicle = self.vehicle
         seized = vehicle.control.seized
         if seized is not None and not (safe and seized.by == "failsafe"):
@@ -292,7 +292,7 @@ class Craft:
             )
         if not vehicle.armed and verb not in ("land", "return_home"):
             raise RobotFailure("robot", f"{vehicle.name} disarmed during {verb}: {vehicle.text}".rstrip(": "))
-        if not outside and not safe and (left := self._breach(before)):
+        if not outside and not safe and (left := self._strayed(told)):
             await self.halt()
             raise RobotFailure(
                 "refused",
@@ -300,9 +300,18 @@ class Craft:
                 remedy="see to the vehicle, and bring it back inside",
             )
 
-    def _breach(self, before: Pose | None = None) -> str:
+    def _strayed(self, told: Sequence[Report]) -> str:
+        """Look at every position that was told, and between them: there may be many between two looks."""
+        flies = self.vehicle.flies
+        for before, here in pairwise(told):
+            apart = apart_s(before, here)
+            if left := breach(self.site, here.pose, flies=flies, before=before.pose, apart_s=apart):
+                return left
+        return self._breach()
+
+    def _breach(self) -> str:
         pose = self.vehicle.pose
-        return "" if pose is None else breach(self.site, pose, flies=self.vehicle.flies, before=before)
+        return "" if pose is None else breach(self.site, pose, flies=self.vehicle.flies)
 
     def target(self, latitude_deg: float, longitude_deg: float, relative_m: float) -> None:
         """Send a position to go to in the guided mode; these are not acknowledged."""

@@ -17,6 +17,7 @@ from appliance.robots.mavlink.control import Control
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.modes import Modes, modes_of
 from appliance.robots.mavlink.said import WARNING, Texts
+from appliance.robots.mavlink.track import Report, Track
 
 Address = tuple[str, int]
 
@@ -95,6 +96,7 @@ class Vehicle:
         self.speed_mps = 0.0
         self.fixed = False
         """A position has been told."""
+        self.track = Track()
         self.battery_percent: float | None = None
         self.home: tuple[float, float, float] | None = None
         """Latitude, longitude (degrees), altitude (metres)."""
@@ -205,7 +207,7 @@ class Vehicle:
             case "HEARTBEAT":
                 changed = self._heartbeat(frame, now) or changed
             case "GLOBAL_POSITION_INT":
-                self._position(message)
+                self._position(message, now)
             case "SYS_STATUS" | "BATTERY_STATUS":
                 if message.battery_remaining != _NO_BATTERY:
                     self.battery_percent = float(message.battery_remaining)
@@ -270,7 +272,7 @@ class Vehicle:
         failsafe = self.condition.failsafe
         return self.control.hear(self.custom_mode, self.armed, failsafe, self.modes, now) or changed
 
-    def _position(self, message: Message) -> None:
+    def _position(self, message: Message, now: float) -> None:
         self.latitude_deg, self.longitude_deg = message.lat / 1e7, message.lon / 1e7
         self.altitude_m, self.relative_m = message.alt / 1e3, message.relative_alt / 1e3
         self.speed_mps = math.hypot(message.vx, message.vy, message.vz) / 100.0
@@ -278,3 +280,5 @@ class Vehicle:
             self.heading_deg = message.hdg / 100.0
         # 0, 0 is what autopilots send before they know: the sea off Ghana is no site.
         self.fixed = message.lat != 0 or message.lon != 0
+        if (pose := self.pose) is not None:
+            self.track.take(Report(pose, message.time_boot_ms, now))

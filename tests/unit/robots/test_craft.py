@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Container
 from typing import Any
 
 import pytest
 
 from appliance.model import Box, Pose, Site
+from appliance.model.geo import to_globe
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.control import Seizure
 from appliance.robots.mavlink.copter import Copter
@@ -36,6 +37,8 @@ class Flown:
         self.sim = SimCopter(system=1, site=Site(), home=(0.0, 0.0))
         self.sent: list[Message] = []
         self.silent = False
+        self.placed = False
+        """Its positions are told by the test alone (`tell`)."""
         self._up, self._down = Codec(242, 191), Codec(1, 1)
         self.vehicle = Vehicle("drone_1", site=Site(), send=self._send, own=242)
         self.craft = Craft(self.vehicle, site=Site(), config=RobotsConfig(ack_timeout_s=0.2))
@@ -67,8 +70,17 @@ class Flown:
         loop = asyncio.get_running_loop()
         while True:
             self.say([*self.sim.step(_EVERY_S * 10, loop.time()), self.sim.heartbeat(), self.sim.mission_current()])
-            self.say([self.sim.requested(dialect.constant("MAVLINK_MSG_ID_GLOBAL_POSITION_INT"))])
+            if not self.placed:
+                self.say([self.sim.requested(dialect.constant("MAVLINK_MSG_ID_GLOBAL_POSITION_INT"))])
             await asyncio.sleep(_EVERY_S)
+
+    def tell(self, x: float, y: float, at_s: float) -> None:
+        """Say that it was there, five metres up, at that time of its own clock."""
+        latitude, longitude, altitude = to_globe(Site(), x, y, 5.0)
+        where = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(altitude * 1e3)}
+        moving = {"vx": 0, "vy": 0, "vz": 0, "hdg": 0}
+        at_ms = round(at_s * 1000)
+        self.hear([dialect.make("GLOBAL_POSITION_INT", time_boot_ms=at_ms, relative_alt=5000, **where, **moving)])
 
     def commands(self, number: int) -> list[Message]:
         """Return the commands of that number that were sent to it."""
@@ -275,12 +287,96 @@ async def test_what_goes_through_a_narrow_area_between_two_looks_is_stopped(flow
     await flown.arm()
     flown.sim.flight.position = flown.sim.flight.target = Point(0.0, 5.0, 5.0)
     assert await flown.craft.confirm(lambda: abs(flown.craft.position().y - 5.0) < 1.0)
-    going = asyncio.create_task(flown.craft.travel("goto", "GUIDED", lambda: False, lambda: 100.0))
-    await asyncio.sleep(_EVERY_S)
+    way = _Endless()
+    going = asyncio.create_task(way.travel(flown.craft))
+    assert await flown.craft.confirm(lambda: way.looks > 0)
     flown.sim.flight.position = flown.sim.flight.target = Point(0.0, 15.0, 5.0)
     with pytest.raises(RobotFailure, match="stopped during goto: it went through the line") as caught:
         await going
     assert caught.value.failure.code == "refused"
+
+
+class _Endless:
+    """A way that never ends by itself; how often it was looked at is counted."""
+
+    def __init__(self) -> None:
+        self.looks = 0
+        self.over: int | None = None
+        """It has arrived after so many looks."""
+
+    def left(self) -> float:
+        """Return what is left, as a look at the way asks for it."""
+        self.looks += 1
+        return 100.0
+
+    async def travel(self, craft: Craft) -> None:
+        """Be under way."""
+        await craft.travel("goto", "GUIDED", lambda: self.over is not None and self.looks >= self.over, self.left)
+
+
+Told = list[tuple[float, float, float]]
+"""Where it says that it was: x, y, and the time of its own clock in seconds."""
+_HANGAR = Box(name="the hangar", x=(0.0, 40.0), y=(0.0, 40.0))
+
+
+async def _goes(flown: Flown, area: Box, told: Told) -> None:
+    """Be under way for some looks; all but the first position is heard at once, between two of them."""
+    flown.craft.site = Site(forbidden=(area,))
+    await flown.arm()
+    flown.placed = True
+    flown.tell(*told[0])
+    way = _Endless()
+    going = asyncio.create_task(way.travel(flown.craft))
+    assert await flown.craft.confirm(lambda: way.looks > 0)
+    for each in told[1:]:
+        flown.tell(*each)
+    way.over = way.looks + 2
+    await going
+
+
+def _past_the_corner(every_s: float, *, first_s: float = 0.0, missing: Container[int] = ()) -> Told:
+    """Along (0, 30), (0, 0), (30, 0) at 5 m/s, without the reports of those numbers; at the corner after 6 s."""
+    times = [first_s + number * every_s for number in range(round(12.0 / every_s)) if number not in missing]
+    return [(max(5.0 * time - 30.0, 0.0), max(30.0 - 5.0 * time, 0.0), 1000.0 + time) for time in times]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        pytest.param(_past_the_corner(0.2), id="5 Hz"),
+        pytest.param(_past_the_corner(0.2, missing=(29, 30, 31)), id="three of 5 Hz lost"),
+        pytest.param(_past_the_corner(1.0), id="1 Hz"),
+        pytest.param(_past_the_corner(1.0, first_s=0.5), id="1 Hz, none at the corner"),
+        pytest.param([(-3.0, 5.0, 1000.0), (5.0, -3.0, 1003.0)], id="an outage of 3 s"),
+        pytest.param([(-3.0, 20.0, 1000.0), (43.0, 20.0, 1030.0)], id="the other side after an outage"),
+        pytest.param([(-3.0, 20.0, 1000.0), (43.0, 20.0, 1.0)], id="a clock that began anew"),
+    ],
+)
+async def test_a_gap_in_the_positions_is_no_flight_through_an_area(flown: Flown, told: Told) -> None:
+    """It went round the corner as it was allowed to, and told so seldom: it goes on."""
+    await _goes(flown, _HANGAR, told)
+    assert not [each for each in flown.sent if each.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        pytest.param([(-5.0, 10.0, 1000.0), (5.0, 10.0, 1003.0)], id="after an outage"),
+        pytest.param([(-2.0, 2.0, 1000.0), (2.0, 2.0, 1001.0), (2.0, -2.0, 1002.0)], id="for a moment"),
+    ],
+)
+async def test_what_was_inside_an_area_is_stopped(flown: Flown, told: Told) -> None:
+    """However long nothing was heard before, and where it had left again before anybody looked."""
+    with pytest.raises(RobotFailure, match="stopped during goto: it is in the hangar") as caught:
+        await _goes(flown, _HANGAR, told)
+    assert caught.value.failure.code == "refused"
+
+
+async def test_a_thin_wall_is_not_crossed_unseen_though_nobody_looked_in_time(flown: Flown) -> None:
+    """Told at 5 Hz and heard all at once: the times of the reports count, not that of looking."""
+    told = [(number - 5.5, 20.0, 1000.0 + number * 0.2) for number in range(12)]
+    with pytest.raises(RobotFailure, match="stopped during goto: it went through the line"):
+        await _goes(flown, Box(name="the line", x=(0.0, 0.02), y=(0.0, 40.0)), told)
 
 
 async def test_a_vehicle_that_is_only_watched_is_not_said_to_be_halted(flown: Flown) -> None:

@@ -121,6 +121,42 @@ def test_a_narrow_area_is_left_by_nobody_unseen() -> None:
     assert breach(site, Pose(x=9.5, y=9.0), flies=True, before=here) == ""
 
 
+HANGAR = Site(forbidden=(Box(name="the hangar", x=(0.0, 40.0), y=(0.0, 40.0)),))
+
+
+def _round_the_corner(metres: float) -> Pose:
+    """So far along the way (0, 30), (0, 0), (30, 0), which keeps to the hangar's edges."""
+    return Pose(x=max(metres - 30.0, 0.0), y=max(30.0 - metres, 0.0))
+
+
+@pytest.mark.parametrize("every_s", [0.1, 0.2, 0.4, 0.5, 0.8, 1.0, 3.0])
+@pytest.mark.parametrize("speed_mps", [1.0, 5.0, 8.0, 15.0])
+def test_a_corner_that_is_flown_round_is_not_flown_through(every_s: float, speed_mps: float) -> None:
+    """However seldom the position is told, and wherever on the way: 0.2 s are 5 Hz, 0.8 s are three of those lost."""
+    step = speed_mps * every_s
+    for begun in range(20):
+        at = [begun / 20 * step + number * step for number in range(math.ceil(60.0 / step))]
+        for before, here in pairwise(_round_the_corner(metres) for metres in at):
+            assert breach(HANGAR, here, flies=True, before=before, apart_s=every_s) == "", (before, here)
+
+
+def test_a_line_counts_between_reports_that_follow_one_another() -> None:
+    """Through a wall at 5 Hz, or at 2 Hz with times that vary, is noticed; in a longer gap it may have gone round."""
+    for width in (0.01, 1.0):
+        site = Site(forbidden=(Box(name="the line", x=(10.0, 10.0 + width), y=(0.0, 20.0)),))
+        for half, apart_s in ((0.51, 0.2), (1.25, 0.5), (1.25, 0.52)):
+            before, here = Pose(x=10.0 + width / 2 - half, y=5.0), Pose(x=10.0 + width / 2 + half, y=5.0)
+            assert breach(site, here, flies=True, before=before, apart_s=apart_s) == "it went through the line"
+            assert breach(site, here, flies=True, before=before, apart_s=0.8) == ""
+
+
+def test_what_is_inside_is_noticed_after_any_gap() -> None:
+    """The position alone says so, however long nothing was heard."""
+    for apart_s in (0.2, 0.8, 3.0, math.inf):
+        here = breach(HANGAR, Pose(x=5.0, y=10.0), flies=True, before=Pose(x=-5.0, y=10.0), apart_s=apart_s)
+        assert here == "it is in the hangar"
+
+
 def test_what_has_left_the_site() -> None:
     """Beyond the fence, above the ceiling or in a forbidden area; grazing the edge is not left."""
     assert breach(SITE, Pose(x=20, y=20, z=10), flies=True) == ""
