@@ -163,14 +163,17 @@ async def test_killed_recorder_loses_at_most_a_second(gateway: Session, tmp_path
     sent = 0
     accounts: list[RecorderStatus] = []
 
+    def take(_: str, status: RecorderStatus | None) -> None:
+        # None is a status that was deleted.
+        if status is not None:
+            accounts.append(status)
+
     def a_second_ago() -> int:
         """How many messages it had by then."""
         return max((each.messages for each in accounts if accounts[-1].at_ns - each.at_ns >= 10**9), default=0)
 
     try:
-        gateway.subscribe_typed(
-            gateway.keys.recorder_status(), RecorderStatus, lambda _, status: accounts.append(status)
-        )
+        gateway.subscribe_typed(gateway.keys.recorder_status(), RecorderStatus, take)
         await _until(lambda: accounts)
         started = time.monotonic()
         while a_second_ago() < 500:
