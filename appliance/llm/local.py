@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -273,20 +274,21 @@ class LocalTier:
         )
         began = time.monotonic()
         proposals = self._read(await self._asked(process, question), context, process)
-        likeliest = proposals[0]
+        best, broken = self._best(proposals, context)
         # What breaks a rule of plans was not meant; the next likely answer that breaks none was. Where all do, others
         # are looked for once, in the time that is left.
         left_s = question.deadline_s - (time.monotonic() - began)
-        if all(self._unsound(each.plan, context) for each in proposals) and left_s > 0:
+        if broken and left_s > 0:
             thorough = msgspec.structs.replace(question, thorough=True, deadline_s=left_s)
             with contextlib.suppress(PlanError, DeadlineError, UnreachableError):
-                proposals = self._read(await self._asked(process, thorough), context, process)
-        sound = next((each for each in proposals if not self._unsound(each.plan, context)), None)
-        if sound is not None:
-            return sound
+                other, less = self._best(self._read(await self._asked(process, thorough), context, process), context)
+                if less < broken:
+                    best, broken = other, less
+        if not broken:
+            return best
         # With its problems, for whoever repairs or refuses it, and at most for an operator to look at.
         most = _UNSOUND * self._config.local_min_confidence
-        return msgspec.structs.replace(likeliest, confidence=min(likeliest.confidence, most))
+        return msgspec.structs.replace(best, confidence=min(best.confidence, most))
 
     async def _asked(self, process: ModelProcess, question: Question) -> Said:
         said = _said(await process.exchange({"question": msgspec.to_builtins(question)}))
@@ -306,18 +308,22 @@ class LocalTier:
                 found.append(_proposed(read(other.symbols, words, self._catalogue), other.confidence, process))
         return found
 
-    def _unsound(self, plan: Plan, context: PlanContext) -> bool:
-        """Whether a plan breaks a rule that all plans keep, or contradicts itself.
+    def _best(self, proposals: Sequence[Proposal], context: PlanContext) -> tuple[Proposal, int]:
+        """Return the first that breaks no rule, else the first of those that break least, and how much it breaks."""
+        broken = [self._broken(each.plan, context) for each in proposals]
+        return proposals[broken.index(min(broken))], min(broken)
+
+    def _broken(self, plan: Plan, context: PlanContext) -> int:
+        """Return 0 for a plan that keeps all rules, 1 if the validator refuses it, 2 if it cannot be what was meant.
 
         The safety policy has no say: what is forbidden is refused, and nothing else done in its place.
         """
-        if not plan.subtasks or validate(plan, self._catalogue, robots=context.robots, site=context.site):
-            return True
-        if any(contradictions(plan)):
-            return True
         robots = tuple(robot.id for robot in context.robots or ())
         meaning = Meaning(instruction=context.instruction, robots=robots, domain=plan.domain, subtasks=plan.subtasks)
-        return bool(problems(meaning, self._catalogue))
+        refused = not plan.subtasks or validate(plan, self._catalogue, robots=context.robots, site=context.site)
+        if not plan.subtasks or problems(meaning, self._catalogue) or any(contradictions(plan)):
+            return 2
+        return 1 if refused else 0
 
     def _note(self, tokens: int, ms: float, reused: int) -> None:
         self._answered += 1

@@ -205,8 +205,9 @@ def _feeds(subtask: Subtask, meaning: Meaning, reach: dict[str, frozenset[str]])
 
 
 def _moves(meaning: Meaning) -> Iterable[str]:
-    """A goto to where the robot already is, and a thing put down that was never picked up."""
+    """A way to where the robot already is, up or down too, and a thing put down that was never picked up."""
     where: dict[str, object] = {}
+    height: dict[str, str] = {}
     held: set[tuple[str, object]] = set()
     holding = bool(_HELD.search(meaning.instruction.lower()))
     for subtask in meaning.subtasks:
@@ -215,6 +216,15 @@ def _moves(meaning: Meaning) -> Iterable[str]:
             if where.get(robot) == subtask.params["place"]:
                 yield f"{subtask.id}: {robot} was sent there before, and nowhere since"
             where[robot] = subtask.params["place"]
+        elif subtask.skill in ("takeoff", "land"):
+            if height.get(robot) == subtask.skill and subtask.skill == "land":
+                yield f"{subtask.id}: {robot} has landed already"
+            height[robot] = subtask.skill
+        elif subtask.skill in ("return_home", "dock"):
+            there = (subtask.skill, *sorted(map(str, subtask.params.items())))
+            if where.get(robot) == there:
+                yield f"{subtask.id}: {robot} is there already"
+            where[robot] = there
         elif _travels(subtask.skill):
             where.pop(robot, None)
         elif subtask.skill == "pick":
@@ -228,8 +238,7 @@ def _moves(meaning: Meaning) -> Iterable[str]:
 def _travels(skill: str) -> bool:
     """Whether a skill other than goto takes a robot elsewhere."""
     return skill in {
-        "follow_path", "patrol", "explore", "map_area", "return_home", "dock", "follow", "guide", "rendezvous",
-        "lift_together",
+        "follow_path", "patrol", "explore", "map_area", "follow", "guide", "rendezvous", "lift_together", "orbit",
     }  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError
 from appliance.llm.local import LocalTier
@@ -20,6 +21,7 @@ CONTEXT = PlanContext(instruction="rover_1 goes to dock 3", robots=(ROVER,))
 RIGHT = ["navigation", "goto", "w0", "w0", "place:", "w3", "w4"]
 NOWHERE = ["navigation", "goto", "w0", "w0"]
 UNREADABLE = ["navigation", "goto", "w99", "w99", "place:", "w3", "w4"]
+HOME = ["return_home", "w0", "w0"]
 REFUSED = ["none", "chatter"]
 
 
@@ -55,11 +57,11 @@ class Model:
         }
 
 
-async def proposed(model: Model, *, least: float = 0.6) -> Proposal:
+async def proposed(model: Model, context: PlanContext = CONTEXT, *, least: float = 0.6) -> Proposal:
     """Return what the tier proposes where it must be so sure at least."""
     tier = LocalTier(LlmConfig(local_model=Model.folder, local_min_confidence=least), CATALOGUE)
     tier._process = model  # pyright: ignore[reportAttributeAccessIssue]
-    return await tier.propose(CONTEXT)
+    return await tier.propose(context)
 
 
 async def asked(*answers: tuple[list[str], float]) -> tuple[dict[str, object], float]:
@@ -90,6 +92,14 @@ async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
     assert model.asked == [False, True]
 
 
+async def test_of_plans_that_robots_cannot_do_the_one_that_is_meant_is_told() -> None:
+    """The validator refuses both; the likelier one cannot be meant, and the refusal should be of what was asked for."""
+    here = replace(CONTEXT, robots=(RobotInfo(id="rover_1", kind="zenoh"),))
+    there_twice = [*RIGHT, "|", *RIGHT[1:], "<", "1"]
+    proposal = await proposed(Model([(there_twice, 0.6), (RIGHT, 0.3)]), here)
+    assert [each.params for each in proposal.plan.subtasks] == [{"place": "dock 3"}]
+
+
 async def test_the_plan_there_is_outlives_a_second_look_that_fails() -> None:
     """Late, a refusal, no plan at all: the likeliest of the first answers is what is told."""
     for thorough in ([(REFUSED, 0.9)], [(UNREADABLE, 0.9)], DeadlineError("no answer within 1 s")):
@@ -109,6 +119,9 @@ async def test_no_threshold_lets_a_plan_through_that_breaks_a_rule() -> None:
     [
         pytest.param([*RIGHT, "|", *RIGHT[1:], "<", "1"], id="a way to where it already is"),
         pytest.param([*RIGHT, "|", "goto", "w0", "w0", "place:", "w4", "w4"], id="two ways at once"),
+        pytest.param(
+            ["navigation", "return_home", "w0", "w0", "|", "return_home", "w0", "w0", "<", "1"], id="home twice"
+        ),
         pytest.param(["manipulation", *RIGHT[1:]], id="a domain of none of its skills"),
     ],
 )
