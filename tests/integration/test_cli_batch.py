@@ -15,7 +15,8 @@ PATIENCE_S = 120.0
 
 def command(*arguments: str) -> list[str]:
     """Return the command line of `swiftbot plan`."""
-    return [sys.executable, "-m", "appliance.cli", "plan", *arguments]
+    # Where the tests run in the background of a shell, SIGINT is ignored by all that they start.
+    return ["env", "--default-signal=INT", sys.executable, "-m", "appliance.cli", "plan", *arguments]
 
 
 def environment(root: Path) -> dict[str, str]:
