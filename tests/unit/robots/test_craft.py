@@ -39,6 +39,8 @@ class Flown:
         self.silent = False
         self.placed = False
         """Its positions are told by the test alone (`tell`)."""
+        self.standing = False
+        """Whether time stands still for what flies; it answers and tells of itself all the same."""
         self._up, self._down = Codec(242, 191), Codec(1, 1)
         self.vehicle = Vehicle("drone_1", site=Site(), send=self._send, own=242)
         self.craft = Craft(self.vehicle, site=Site(), config=RobotsConfig(ack_timeout_s=0.2))
@@ -69,7 +71,8 @@ class Flown:
         """Let time pass, ten times as fast, with heartbeats and positions."""
         loop = asyncio.get_running_loop()
         while True:
-            self.say([*self.sim.step(_EVERY_S * 10, loop.time()), self.sim.heartbeat(), self.sim.mission_current()])
+            passed_s = 0.0 if self.standing else _EVERY_S * 10
+            self.say([*self.sim.step(passed_s, loop.time()), self.sim.heartbeat(), self.sim.mission_current()])
             if not self.placed:
                 self.say([self.sim.requested(dialect.constant("MAVLINK_MSG_ID_GLOBAL_POSITION_INT"))])
             await asyncio.sleep(_EVERY_S)
@@ -111,8 +114,10 @@ async def flown() -> AsyncIterator[Flown]:
 async def test_a_halt_ends_a_take_off_that_has_not_left_the_ground(flown: Flown) -> None:
     """Armed in GUIDED with a take-off given: the mode is the right one already, and it stays on the ground."""
     await flown.arm()
+    flown.standing = True
     flown.sim.flight.target = flown.sim.flight.position._replace(z=5.0)
     await flown.craft.halt()
+    flown.standing = False
     await flown.until_still()
     assert flown.sim.flight.landed
     assert flown.sim.flight.target is None
