@@ -29,7 +29,7 @@ import torch
 from torch.utils.data import DataLoader
 from transformers import LlamaForCausalLM
 
-from appliance.errors import ConflictError
+from appliance.errors import ConflictError, PrerequisiteError
 from appliance.llm.train.batches import Batch, Groups
 from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.ending import Stopping, ended
@@ -156,9 +156,17 @@ class Trainer:
             "steps": self.recipe.steps,
             "cooling": self._step > cools_at(self.recipe),
         }
-        torch.save(state, self._folder / "checkpoint.new")
-        (self._folder / "checkpoint.new").replace(self._folder / CHECKPOINT)
-        self._model.save_pretrained(self._folder / "model")
+        new = self._folder / "checkpoint.new"
+        try:
+            torch.save(state, new)
+            new.replace(self._folder / CHECKPOINT)
+            self._model.save_pretrained(self._folder / "model")
+        except (OSError, RuntimeError) as error:  # RuntimeError: PyTorch's word for a full disk
+            new.unlink(missing_ok=True)
+            raise PrerequisiteError(
+                f"{self._folder} cannot be written at step {self._step:,}: {error}",
+                remedy="make room and run it again: it goes on from the checkpoint before",
+            ) from error
 
     def run(self, *, minutes: float = math.inf, look_every: int = 500) -> dict[str, Any]:
         """Train until the recipe's steps are done or the time is over; return the last figures."""

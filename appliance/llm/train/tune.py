@@ -21,7 +21,7 @@ import torch
 
 from appliance.llm.train.ending import ended
 from appliance.llm.train.fit import Trainer
-from appliance.llm.train.model import Base
+from appliance.llm.train.model import RECIPE, Base
 from appliance.llm.train.site import Pairs, read_pairs
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
@@ -62,7 +62,7 @@ def tune(
         raise SystemExit(f"{plans} has no pair to learn from")
     begin = Base(base)
     recipe = replace(begin.recipe, steps=steps, rate=rate, warmup=min(100, steps // 10))
-    if not folder.exists():
+    if not (folder / RECIPE).is_file():  # else it was stopped, and goes on
         begin.prepare(folder, catalogue, recipe)
         (folder / SITE).write_text(json.dumps({"skills": [str(each) for each in skills]}))
     trainer = Trainer(
