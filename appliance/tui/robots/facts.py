@@ -86,7 +86,7 @@ def state_cell(robot: Robot) -> tuple[str, str]:
     if robot.lease is not None:
         return f"⇅ {safe(robot.lease.text, 80)}", "magenta"
     words = " ".join(part for part in (f"holds {info.holding}" if info.holding else "", info.note) if part)
-    return f"✔ {safe(words, 80)}".rstrip(), "green"
+    return f"✔ {safe(words, 80) or 'online'}", "green"
 
 
 def battery_cell(info: RobotInfo) -> tuple[str, str]:
