@@ -46,8 +46,9 @@ async def until_done(client: FleetClient, task: str, share: float) -> None:
     # Progress is pushed and not written: whoever asks another gateway than the task's coordinator does not find it.
     async with asyncio.timeout(120), aclosing(client.watch(task, poll_s=0.3)) as records:
         async for record in records:
-            found = record.of("s1")
-            if found.state is SubtaskState.RUNNING and found.progress >= share:
+            # A record that was accepted has no subtasks until its plan is made.
+            found = record.of("s1") if record.subtasks else None
+            if found is not None and found.state is SubtaskState.RUNNING and found.progress >= share:
                 return
     raise AssertionError(f"{task} ended before that")
 
@@ -125,8 +126,9 @@ async def until_told(client: FleetClient, task: str) -> SubtaskRecord:
     """Wait until the record has a partial result of a task's first subtask, which runs."""
     async with asyncio.timeout(120), aclosing(client.watch(task, poll_s=0.3)) as records:
         async for record in records:
-            found = record.of("s1")
-            if found.state is SubtaskState.RUNNING and found.partial is not None:
+            # A record that was accepted has no subtasks until its plan is made.
+            found = record.of("s1") if record.subtasks else None
+            if found is not None and found.state is SubtaskState.RUNNING and found.partial is not None:
                 return found
     raise AssertionError(f"{task} ended before that")
 
