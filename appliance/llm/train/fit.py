@@ -29,7 +29,7 @@ import torch
 from torch.utils.data import DataLoader
 from transformers import LlamaForCausalLM
 
-from appliance.errors import ConflictError, PrerequisiteError
+from appliance.errors import ConflictError
 from appliance.llm.train.batches import Batch, Groups
 from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.ending import Stopping, ended
@@ -40,6 +40,7 @@ from appliance.llm.train.model import CHECKPOINT, RECIPE, Base, Recipe, new_mode
 from appliance.llm.train.site import Pairs
 from appliance.llm.train.splits import split
 from appliance.llm.train.tokens import Tokens
+from appliance.llm.train.writing import replace_text, writing
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 TRUNK = "trunk.pt"
@@ -98,7 +99,8 @@ class Trainer:
         self._folder = folder
         self._progress = progress
         self._workers = workers
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(f"{folder}", remedy="name a folder that can be written"):
+            folder.mkdir(parents=True, exist_ok=True)
         self._catalogue = catalogue or load_catalogue()
         self._splits = split(corpus_examples(self._catalogue))
         self._held_out = {name: getattr(self._splits, name) for name in ("structure", "vocabulary", "chance")}
@@ -114,8 +116,9 @@ class Trainer:
         else:
             words = [word for example in self._splits.train for word in example.words]
             self._tokens = Tokens.learn(words, self._catalogue)
-            self._tokens.save(folder)
-        kept.write_text(json.dumps(asdict(recipe), indent=1))
+            with writing(f"{folder}", remedy="make room and run it again"):
+                self._tokens.save(folder)
+        replace_text(kept, json.dumps(asdict(recipe), indent=1))
         self.recipe = recipe
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._model: Any = new_model(recipe, self._tokens).to(self._device)
@@ -157,16 +160,14 @@ class Trainer:
             "cooling": self._step > cools_at(self.recipe),
         }
         new = self._folder / "checkpoint.new"
-        try:
+        with writing(
+            f"{self._folder} at step {self._step:,}",
+            remedy="make room and run it again: it goes on from the checkpoint before",
+            unfinished=(new,),
+        ):
             torch.save(state, new)
             new.replace(self._folder / CHECKPOINT)
             self._model.save_pretrained(self._folder / "model")
-        except (OSError, RuntimeError) as error:  # RuntimeError: PyTorch's word for a full disk
-            new.unlink(missing_ok=True)
-            raise PrerequisiteError(
-                f"{self._folder} cannot be written at step {self._step:,}: {error}",
-                remedy="make room and run it again: it goes on from the checkpoint before",
-            ) from error
 
     def run(self, *, minutes: float = math.inf, look_every: int = 500) -> dict[str, Any]:
         """Train until the recipe's steps are done or the time is over; return the last figures."""
@@ -190,7 +191,9 @@ class Trainer:
                 self._compare(inputs[:4], labels[:4])
             if self._step == cools_at(self.recipe):
                 self.save()
-                shutil.copyfile(self._folder / CHECKPOINT, self._folder / TRUNK)
+                trunk = self._folder / TRUNK
+                with writing(f"{trunk}", remedy="make room and run it again", unfinished=(trunk,)):
+                    shutil.copyfile(self._folder / CHECKPOINT, trunk)
             losses.append(self._learn(inputs, labels))
             del losses[:-200]
             seen += inputs.numel()
@@ -210,7 +213,7 @@ class Trainer:
         if stopping.asked:
             return {}
         figures = self._look(100_000)
-        (self._folder / "figures.json").write_text(json.dumps(figures, indent=1))
+        replace_text(self._folder / "figures.json", json.dumps(figures, indent=1))
         return figures
 
     def _compare(self, inputs: torch.Tensor, labels: torch.Tensor) -> None:
@@ -271,7 +274,10 @@ class Trainer:
             figures[name] = judge(self._model, self._tokens, examples[:most], self._catalogue)
             self._progress(f"  {name}: {figures[name]}")
         self._model.train()
-        with (self._folder / "log.jsonl").open("a") as log:
+        with (
+            writing(f"{self._folder}/log.jsonl", remedy="make room and run it again"),
+            (self._folder / "log.jsonl").open("a") as log,
+        ):
             log.write(json.dumps(figures) + "\n")
         return figures
 

@@ -19,6 +19,7 @@ from appliance.llm.embedded import folder_of
 from appliance.llm.train.batches import CONTEXT
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
 from appliance.llm.train.weights import is_model, read_weights
+from appliance.llm.train.writing import writing
 from appliance.skills.catalogue import Catalogue
 
 CHECKPOINT = "checkpoint.pt"
@@ -100,6 +101,10 @@ class Base:
             folder: of the new run; must not exist.
             catalogue: its skills.
             recipe: how it is trained; as large as this one is.
+
+        Raises:
+            ConflictError: there is such a folder already.
+            PrerequisiteError: it cannot be written; nothing of it is left, so that the same can be asked again.
         """
         tokens = Tokens.load(self.folder).extended(catalogue)
         state = dict(self.state)
@@ -110,9 +115,10 @@ class Base:
         new_model(recipe, tokens).load_state_dict(state)  # it fits, or says what does not
         if folder.exists():
             raise ConflictError(f"{folder} is there already", remedy="name another folder, or remove that one")
-        folder.mkdir(parents=True)
-        tokens.save(folder)
         begun = {"optimisers": [], "step": 0, "group": 0, "inside": 0, "steps": recipe.steps, "cooling": False}
-        torch.save({"model": state, **begun}, folder / CHECKPOINT)
-        # Last: a folder with a recipe is a run to go on with, and one without weights would begin at random.
-        (folder / RECIPE).write_text(json.dumps(asdict(recipe), indent=1))
+        with writing(f"{folder}", remedy="make room, or name a folder on another disk", unfinished=(folder,)):
+            folder.mkdir(parents=True)
+            tokens.save(folder)
+            torch.save({"model": state, **begun}, folder / CHECKPOINT)
+            # Last: a folder with a recipe is a run to go on with, and one without weights would begin at random.
+            (folder / RECIPE).write_text(json.dumps(asdict(recipe), indent=1))
