@@ -25,6 +25,7 @@ from appliance.errors import NotFoundError, PayloadError, PlanError
 from appliance.llm.batch import everyman, prediction
 from appliance.llm.cascade import Decomposer, Slot
 from appliance.llm.routing.budget import Budget
+from appliance.llm.scoring import Score, mean_figures
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tiers import configured
 from appliance.model import Plan, Tier
@@ -34,7 +35,6 @@ Progress = Callable[[str], None]
 _REPOSITORY = Path(__file__).resolve().parents[3]
 AT_ONCE = 16
 """Cases at a time that the real cascade is given: most of them wait for the stand-in."""
-FIGURES = ("decomposition", "parallel_recall", "subtask_f1", "param_f1", "exact", "domain", "valid")
 
 
 class Case(Struct, frozen=True):
@@ -99,23 +99,23 @@ async def run(
     }
     decomposer = Decomposer(asking, catalogue)
     await decomposer.start()
-    rows: list[dict[str, Any]] = []
+    rows: list[Score] = []
     answered: list[Answered] = []
-    taken: list[dict[str, Any]] = []
-    domains: dict[str, list[dict[str, Any]]] = {}
+    taken: list[Score] = []
+    domains: dict[str, list[Score]] = {}
     latency: list[float] = []
     tiers: dict[str, int] = {}
     try:
         for case in found:
             plan = await _plan(decomposer, case, catalogue)
-            row = score.score_case(msgspec.to_builtins(case), _prediction(plan))
+            row = _scored(score, case, _prediction(plan))
             rows.append(row)
             answered.append(
                 Answered(
                     confidence=plan.confidence if plan is not None else 0.0,
                     latency_ms=plan.latency_ms if plan is not None else 0.0,
-                    row=row,
-                    gold=score.score_case(msgspec.to_builtins(case), case.gold),
+                    row=msgspec.to_builtins(row),
+                    gold=msgspec.to_builtins(_scored(score, case, case.gold)),
                 )
             )
             domains.setdefault(str(case.gold.get("domain")), []).append(row)
@@ -126,16 +126,16 @@ async def run(
             tiers[plan.tier.value] = tiers.get(plan.tier.value, 0) + 1
             if plan.confidence >= least[plan.tier.value]:
                 taken.append(row)
-            if not row["exact"]:
-                progress(f"{case.id}: confidence {plan.confidence:.2f}, decomposition {row['decomposition']:.2f}")
+            if not row.exact:
+                progress(f"{case.id}: confidence {plan.confidence:.2f}, decomposition {row.decomposition:.2f}")
     finally:
         await decomposer.close()
     latency.sort()
     first = decomposer.tiers[0] if decomposer.tiers else "none"
     return {
-        "all": _average(rows),
-        "taken": _average(taken),
-        "by_domain": {name: _average(each)["decomposition"] for name, each in sorted(domains.items())},
+        "all": mean_figures(rows),
+        "taken": mean_figures(taken),
+        "by_domain": {name: mean_figures(each)["decomposition"] for name, each in sorted(domains.items())},
         "latency_ms": {"p50": _at(latency, 0.5), "p99": _at(latency, 0.99)},
         "tiers": tiers,
         "routed_on": f"the confidence of {first}" + (": there is no local model" if first != "local" else ""),
@@ -157,12 +157,12 @@ async def _cascade(
     await decomposer.start()
     turns = asyncio.Semaphore(AT_ONCE)
 
-    async def one(case: Case) -> tuple[dict[str, Any], Plan | None, float]:
+    async def one(case: Case) -> tuple[Score, Plan | None, float]:
         async with turns:
             began = time.monotonic()
             plan = await _plan(decomposer, case, catalogue)
             elapsed = 1000 * (time.monotonic() - began)
-        return score.score_case(msgspec.to_builtins(case), _prediction(plan)), plan, elapsed
+        return _scored(score, case, _prediction(plan)), plan, elapsed
 
     try:
         found = await asyncio.gather(*(one(case) for case in cases))
@@ -171,7 +171,7 @@ async def _cascade(
     times = sorted(elapsed for _, _, elapsed in found)
     escalated = sum(plan is not None and plan.tier is Tier.UPSTREAM for _, plan, _ in found)
     return {
-        "figures": _average([row for row, _, _ in found]),
+        "figures": mean_figures([row for row, _, _ in found]),
         "escalated": round(100 * escalated / max(1, len(found)), 1),
         "thresholds": {slot.planner.name.value: slot.min_confidence for slot in slots[:-1]},
         "latency_ms": {"p50": _at(times, 0.5), "p99": _at(times, 0.99)},
@@ -191,16 +191,13 @@ async def _plan(decomposer: Decomposer, case: Case, catalogue: Catalogue) -> Pla
         return None
 
 
+def _scored(scorer: ModuleType, case: Case, said: dict[str, Any]) -> Score:
+    """Return the figures of a plan as the set's own scorer counts them."""
+    return msgspec.convert(scorer.score_case(msgspec.to_builtins(case), said), Score)
+
+
 def _prediction(plan: Plan | None) -> dict[str, Any]:
     return {} if plan is None else prediction("", plan)
-
-
-def _average(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    figures: dict[str, Any] = {"cases": len(rows)}
-    for name in FIGURES:
-        values = [float(row[name]) for row in rows if row[name] is not None]
-        figures[name] = round(100 * sum(values) / len(values), 1) if values else None
-    return figures
 
 
 def _at(ordered: Sequence[float], part: float) -> float | None:
