@@ -14,11 +14,11 @@ from msgspec import Struct
 from appliance.llm.language.codec import ANY
 from appliance.llm.train.examples import ROBOT, Example, said, spans
 
-STRUCTURES = 12
+STRUCTURES = 24
 """One in so many structures is held out, of those with at least three subtasks."""
-NAMES = 40
+NAMES = 80
 """One in so many names is held out."""
-CHANCE = 50
+CHANCE = 100
 """One in so many of the other pairs is held out."""
 
 
