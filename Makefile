@@ -11,7 +11,7 @@ override ASK := $(value ASK)
 export ASK
 
 RUN := scripts/as_user.sh
-PYTEST := $(RUN) python -m pytest -p no:cacheprovider
+PYTEST := $(RUN) python -m pytest -p no:cacheprovider  # nothing is written into the tree
 TUI_FLAG := $(if $(filter-out 0 no false,$(TUI)),--tui)
 
 help: ## This list
@@ -27,7 +27,7 @@ demo: setup ## Start a fleet, run instructions on it, replay its log
 test: ## Set up and run everything: lint, types, import contracts, unit, integration and replay tests
 	scripts/setup.sh dev --with-browser
 	$(MAKE) --no-print-directory lint formatted types contracts READY=1
-	$(PYTEST) tests
+	scripts/whole_suite.sh tests
 
 # Types and tests take longest, and neither needs the other: at the same time.
 check: ready ## The fast part: lint, types, import contracts, unit tests with few examples of each property
