@@ -11,7 +11,7 @@ here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 run() { "$here/as_user.sh" "$@"; }
 memory=$(run mktemp -d --tmpdir swiftbot-suite.XXXXXX) # of which tests failed
 trap 'run rm -rf "$memory"' EXIT
-suite() { run python -m pytest -o "cache_dir=$memory" "--hypothesis-seed=$seed" "$@"; }
+suite() { run "${PYTHON:-python}" -m pytest -o "cache_dir=$memory" "--hypothesis-seed=$seed" "$@"; }
 
 seed=$RANDOM
 status=0

@@ -198,7 +198,9 @@ async def test_both_halves_go_on_and_meet_again(tmp_path: Path) -> None:
                 if all(split.settled for split in splits) and any("doubled" in split.note for split in splits):
                     break
                 await asyncio.sleep(0.2)
-        assert [await here.task(task) for task in tasks] == [await there.task(task) for task in tasks]
+        async with asyncio.timeout(60):
+            while [await here.task(task) for task in tasks] != [await there.task(task) for task in tasks]:
+                await asyncio.sleep(0.2)
         told = [notices.get_nowait() for _ in range(notices.qsize())]
         assert any("partition" in each.text for each in told), told
 

@@ -1,7 +1,9 @@
 """The scripts around the product: what they run keeps its exit status, its arguments and its signals."""
 
+import os
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,39 @@ def test_signals_reach_the_command(project_root: Path, number: signal.Signals) -
         assert process.stdout.readline() == "up\n"
         process.send_signal(number)
         assert process.wait(timeout=30) == 9
+
+
+LATE_ONCE = """
+from pathlib import Path
+
+
+def test_late() -> None:
+    mark = Path(__file__).with_suffix(".ran")
+    ran = mark.exists()
+    mark.touch()
+    assert ran, "late"
+
+
+def test_well() -> None:
+    pass
+"""
+
+
+@pytest.mark.parametrize(("test", "status"), [(LATE_ONCE, 0), ("def test() -> None:\n    assert 0\n", 1)])
+def test_what_fails_is_run_once_more_by_itself(project_root: Path, tmp_path: Path, test: str, status: int) -> None:
+    """A test that was late once is named and passes by itself; one that fails again fails the suite."""
+    (tmp_path / "test_it.py").write_text(test)
+    done = subprocess.run(
+        [str(project_root / "scripts" / "whole_suite.sh"), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHON": sys.executable},
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    assert done.stdout.count("test session starts") == 2
+    assert "These failed and are run once more" in done.stdout
+    assert ("at the second run only" in done.stdout) == (status == 0)
 
 
 def test_an_unknown_argument_of_setup_is_refused(project_root: Path) -> None:
