@@ -312,6 +312,7 @@ class Starter:
             "modules": list(dict.fromkeys(modules)),
             "site": self._site,
             "volumes": "/volumes",
+            "reserve_mb": self._config.transfer.reserve_mb,
             "patience_s": PRELOAD_PART * self._config.start_timeout_s,
             "proven": self._made(info.image) in self._proven,
         }

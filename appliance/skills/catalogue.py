@@ -96,7 +96,7 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     preload_s: Annotated[float, Meta(gt=0, le=600)] = 10.0
     """Longest `preload`; all that a container loads has at most 40 % of `pool.start_timeout_s` besides."""
     file_mb: Annotated[int, Meta(ge=1, le=1 << 20)] = 256
-    """Longest file its runs may write, in a volume too: a volume has no other bound."""
+    """Longest file its runs may write, in a volume too; what they write there together ends where the disk is short."""
     timeout_s: Annotated[float, Meta(gt=0, le=86400)] = 120.0
     """Longest run, beyond a `duration_s` that was asked for."""
     retries: Annotated[int, Meta(ge=0, le=10)] = 1

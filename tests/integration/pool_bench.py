@@ -3,13 +3,14 @@
 import asyncio
 import secrets
 import textwrap
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 from appliance.model import ContainerState, Need, RunEvent, RunRequest, Site
 from appliance.pool.engine import PodmanEngine
 from appliance.pool.pool import Call, Pool
+from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue
@@ -84,8 +85,10 @@ class Bench:
         self.fleet = f"test-{secrets.token_hex(4)}"
         self.pools: list[Pool] = []
 
-    async def pool(self, *, gateway: str = "g1", fleet: str = "", **settings: Any) -> Pool:
-        """Return a started pool."""
+    async def pool(
+        self, *, gateway: str = "g1", fleet: str = "", read_memory: Callable[[], Reading] | None = None, **settings: Any
+    ) -> Pool:
+        """Return a started pool; `read_memory` stands for what the kernel says of memory."""
 
         async def nobody(need: Need, avoid: Collection[str]) -> list[Candidate]:
             return []
@@ -104,6 +107,7 @@ class Bench:
             find_remote=nobody,
             on_call=answer,
             on_change=lambda _: None,
+            read_memory=read_memory,
         )
         self.pools.append(pool)
         await pool.start()

@@ -20,6 +20,7 @@ from appliance.model import ContainerState, RunEvent, RunEventKind
 from appliance.pool import images
 from appliance.pool.engine import remove_fleet
 from appliance.pool.pool import Pool
+from appliance.pool.transfer.settings import TransferConfig
 from appliance.skills.catalogue import load_catalogue
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(240)]
@@ -84,6 +85,26 @@ def run(ctx):
                     file.write(bytes(2**20))
         finally:
             path.unlink()
+    if do == "fill volume with files":
+        # Bounded for the disk's sake: 256 MB, then it only looks as if it went on.
+        for number in range(64):
+            (ctx.volume("keep") / str(number)).write_bytes(bytes(4 * 2**20))
+        time.sleep(60)
+    if do == "fill volume deaf":
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        for number in range(64):
+            (ctx.volume("keep") / str(number)).write_bytes(bytes(4 * 2**20))
+        while True:
+            pass
+    if do == "write a little":
+        (ctx.volume("keep") / "little").write_bytes(bytes(2**20))
+        return {{"left": sorted(os.listdir(ctx.volume("keep")))[:1]}}
+    if do == "tick":
+        number = 0
+        while True:
+            number += 1
+            ctx.progress(0.5, str(number))
+            time.sleep(0.02)
     if do == "print":
         for _ in range(100):
             print("x" * 2**20)
@@ -281,6 +302,51 @@ async def test_what_leaves_its_bounds(bench: Bench, pool: Pool, do: str) -> None
     final = await bench.run(pool, do, next(NUMBERS))
     after = await _next_run_works(bench, pool)
     assert after.container == final.container
+
+
+@pytest.mark.parametrize("do", ["fill volume with files", "fill volume deaf"])
+async def test_a_volume_is_filled_without_end(bench: Bench, do: str) -> None:
+    """A run that goes on writing files while the disk is short is ended, be it deaf; what writes little is served."""
+    # More than any disk has is to be left free: it is short from the beginning.
+    short = TransferConfig(reserve_mb=2**40)
+    pool = await bench.pool(gateway=f"full{next(NUMBERS)}", capacity=1, transfer=short)
+    await bench.ready(pool)
+    final = await bench.run(pool, do, next(NUMBERS), deadline_s=60.0)
+    assert final.failure is not None
+    assert (final.failure.code, final.failure.retryable) == ("disk", True), final.failure
+    assert "the disk of its volumes is nearly full" in final.failure.message
+    assert "make room on the disk" in final.failure.remedy
+    await bench.ready(pool)
+    after = await bench.run(pool, "write a little", next(NUMBERS))
+    assert after.kind is RunEventKind.SUCCEEDED, after.failure
+    assert after.container == final.container
+    await pool.stop(keep_containers=False)
+
+
+async def test_a_neighbour_is_not_touched(bench: Bench) -> None:
+    """While one run crashes, loops, forks and fills what it can, the one in the next container works on undisturbed."""
+    pool = await bench.pool(
+        gateway="pair", floor={"base": 2}, capacity=2, user_processes=_processes_of_mine() + 200, start_timeout_s=60.0
+    )
+    await bench.ready(pool, 2)
+    ticks: list[RunEvent] = []
+    request = bench.request("tick", next(NUMBERS), deadline_s=200.0)
+    decision = await pool.select(request.need, allow_remote=False)
+    neighbour = asyncio.create_task(pool.run(request, decision, ticks.append))
+    for do in ("segv", "hang deaf", "memory", "bomb", "fill scratch", "print", "kill all", "garbage"):
+        await bench.ready(pool)
+        await bench.run(pool, do, next(NUMBERS), deadline_s=1.0 if do.startswith("hang") else 60.0)
+        before = len(ticks)
+        async with asyncio.timeout(60):
+            while len(ticks) < before + 3:
+                assert not neighbour.done(), (do, neighbour.result())
+                await asyncio.sleep(0.02)
+    assert await pool.cancel(request.run_id)
+    final = await neighbour
+    assert final.failure is not None
+    assert final.failure.code == "cancelled"
+    assert {each.container for each in ticks} == {final.container}
+    await pool.stop(keep_containers=False)
 
 
 async def _in_mid_run(bench: Bench, pool: Pool, deadline_s: float) -> asyncio.Task[RunEvent]:

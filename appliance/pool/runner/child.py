@@ -40,8 +40,11 @@ MAX_ORDER = 64 * 1024
 
 # Bytes of the memory shared with the zygote.
 IN_TRANSIT, DONE, REASON, TAKEN = 0, 1, 2, 3
-REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned", 4: "stopped"}
+REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned", 4: "stopped", 5: "disk"}
 SLOW = "raise timeout_s in its skill.toml, or find out what it waits for"
+FULL = "remove from its volumes what is not needed any more, have it write less, or make room on the disk"
+REMEDIES = {"deadline": SLOW, "disk": FULL}
+TEXTS = {"disk": "the disk of its volumes is nearly full, and it had written much there"}
 LARGE = "put large things with ctx.put_artifact and return the reference"
 BROKEN = "its last lines are in the log: mend its handler"
 
@@ -150,8 +153,8 @@ def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - on
 
 def _cancelled(kit: Kit, what: str) -> Frame:
     reason = REASONS.get(kit.shared[REASON], "orphaned")
-    remedy = SLOW if reason == "deadline" else ""
-    return _error(reason, f"{what} was ended: {reason}", remedy=remedy, retryable=reason != "cancelled")
+    text = f"{what} was ended: {TEXTS.get(reason, reason)}"
+    return _error(reason, text, remedy=REMEDIES.get(reason, ""), retryable=reason != "cancelled")
 
 
 def _trace(error: BaseException) -> list[str]:

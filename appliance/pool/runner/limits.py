@@ -49,7 +49,7 @@ def limit_run(*, base: int, memory_mb: int, file_mb: int, timeout_s: float) -> N
     Args:
         base: address space before the run, bytes.
         memory_mb: memory that it may take on top.
-        file_mb: longest file that it may write: a volume has no other bound.
+        file_mb: longest file that it may write; how many of them a volume has room for is watched (`disk.py`).
         timeout_s: its deadline. A busy loop that blocks signals still ends: CPU seconds of all cores over that time.
     """
     _cap(resource.RLIMIT_AS, base + memory_mb * 2**20 + HEADROOM)

@@ -152,7 +152,8 @@ class Run:
             text = f"did not end within {self.timeout_s:g} s"
             remedy = child.SLOW
         elif reason:
-            text = f"was ended: {reason}"
+            text = f"was ended: {child.TEXTS.get(reason, reason)}"
+            remedy = child.REMEDIES.get(reason, "")
         elif code < 0:
             text = f"was killed by {signal.Signals(-code).name}"
             remedy = "look at its last lines and at what it calls that is not Python"

@@ -34,6 +34,8 @@ class Spec:
         self.modules = tuple(str(each) for each in table.get("modules") or ())
         self.site = cast("Table", table.get("site") or {})
         self.volumes = Path(str(table.get("volumes") or "/volumes"))
+        self.reserve_mb = int(table.get("reserve_mb", 0))
+        """What is to be left free on the disk of the volumes, MB; 0: it is not watched."""
         self.patience_s = float(table.get("patience_s", 15.0))
         """Time for everything that is loaded beforehand, together."""
         self.proven = bool(table.get("proven", False))

@@ -22,6 +22,7 @@ from time import monotonic
 from types import FrameType
 
 from . import child, usage
+from .disk import LOOK_S, Disk
 from .frames import Decoder, FrameError, encode
 from .link import Frame
 from .preload import Loaded, explain, resident
@@ -33,6 +34,8 @@ GRACE_S = 2.0
 """From SIGTERM, in which a handler may clean up, to SIGKILL."""
 ORPHAN_GRACE_S = 0.5
 """The same when the gateway is gone and there is nobody to clean up with."""
+DISK_GRACE_S = 0.2
+"""The same when it fills the disk: until it is killed it may write on."""
 
 
 class Connection:
@@ -52,6 +55,7 @@ class Zygote:
         self._scratch = scratch
         self._processes = processes
         self._alone = os.getpid() == 1
+        self._disk = Disk(loaded.spec.volumes, reserve_mb=loaded.spec.reserve_mb)
         self._connections: dict[int, Connection] = {}
         self._run: Run | None = None
         self._ahead: Run | None = None
@@ -114,7 +118,8 @@ class Zygote:
         """Seconds until something is due."""
         if self._run is None:
             return 60.0
-        return max(0.0, self._run.due() - monotonic()) + 0.001
+        left_s = max(0.0, self._run.due() - monotonic()) + 0.001
+        return min(left_s, LOOK_S) if self._disk.watched else left_s
 
     # --- connections ------------------------------------------------------------------------------------------
 
@@ -223,6 +228,7 @@ class Zygote:
         self._epoll.modify(peer, select.EPOLLRDHUP)
         self._run = run
         self._runs += 1
+        self._disk.begin()
 
     def _refusal(self, order: Frame) -> Frame | None:
         skill = str(order.get("skill", ""))
@@ -277,6 +283,8 @@ class Zygote:
             run.kill()
         elif run.kill_at is None and now >= run.deadline:
             run.end(2, GRACE_S)
+        elif run.kill_at is None and self._disk.overrun(now):
+            run.end(5, DISK_GRACE_S)
 
     def _reap(self) -> None:
         while True:

@@ -37,7 +37,8 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     cache_mb: Annotated[int, Meta(ge=1)] = 4096
     """Disk for what is kept ready for others, MB: the last state of each volume, layers of images asked for."""
     reserve_mb: Annotated[int, Meta(ge=0)] = 512
-    """Disk left free, MB: a transfer that would take it is refused."""
+    """Disk left free, MB: a transfer that would take it is refused, and a run that writes much into its volumes while
+    there is less is ended."""
     backups: Annotated[int, Meta(ge=1, le=64)] = 8
     """Kept states of a volume that lost against another gateway's; beyond it the oldest is removed, and logged."""
     use_wait_s: Positive = 5.0

@@ -1,0 +1,120 @@
+"""What a run may take of the disk that its volumes are on."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from appliance.pool.runner import disk
+from appliance.pool.runner.disk import OWN_MB, WALK_S, Disk
+
+ALL_MB = 2**40
+"""More than any disk has: it is always short."""
+
+
+def volumes(tmp_path: Path) -> Path:
+    """Return a folder with two volumes, one of which has had 64 MB of state for long."""
+    folder = tmp_path / "volumes"
+    for name in ("maps", "notes"):
+        (folder / name / "deep").mkdir(parents=True)
+    (folder / "maps" / "old").write_bytes(bytes(64 * 2**20))
+    return folder
+
+
+def watch(folder: Path, *, reserve_mb: int = ALL_MB) -> Disk:
+    """Return a watch of a run that begins, and the kernel's next tick, by which files are stamped, has come."""
+    it = Disk(folder, reserve_mb=reserve_mb)
+    it.begin()
+    clock = folder.parent / "clock"
+    while True:
+        clock.write_bytes(b"x")
+        if clock.stat().st_ctime > it._since:
+            return it
+
+
+def test_who_writes_much_while_the_disk_is_short_has_to_end(tmp_path: Path) -> None:
+    """Only what the run itself wrote counts, in all folders of all volumes together; a little may always be written."""
+    folder = volumes(tmp_path)
+    it = watch(folder)
+    assert it.watched
+    assert not it.overrun(0.0), "what was there before is not the run's"
+    (folder / "notes" / "deep" / "a").write_bytes(bytes((OWN_MB - 2) * 2**20))
+    assert not it.overrun(10.0)
+    (folder / "maps" / "deep" / "b").write_bytes(bytes(4 * 2**20))
+    assert it.overrun(20.0)
+
+
+def test_where_there_is_room_nothing_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enough is left: files are not even counted, however much the run writes."""
+    folder = volumes(tmp_path)
+    it = watch(folder, reserve_mb=1)
+    (folder / "notes" / "a").write_bytes(bytes(2 * OWN_MB * 2**20))
+    monkeypatch.setattr(Disk, "_written", lambda _: pytest.fail("it looked"))
+    assert not it.overrun(0.0)
+
+
+def test_files_are_looked_at_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the disk is short the volumes are gone through now and then, not at each look."""
+    it = watch(volumes(tmp_path))
+    walks: list[float] = []
+    monkeypatch.setattr(Disk, "_written", lambda _: bool(walks.append(0.0)))
+    for tenths in range(25):
+        it.overrun(tenths / 10)
+    assert len(walks) == 3
+    assert WALK_S == 1.0
+
+
+@pytest.mark.parametrize("bound", ["OWN_FILES", "MOST_WALKED"])
+def test_files_without_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str) -> None:
+    """Empty files take inodes: many of the run's own end it, and so does a volume too large to be gone through."""
+    folder = volumes(tmp_path)
+    monkeypatch.setattr(disk, bound, 20)
+    it = watch(folder)
+    assert not it.overrun(0.0)
+    for number in range(30):
+        (folder / "notes" / str(number)).touch()
+    assert it.overrun(10.0)
+
+
+def test_what_is_hidden_counts_as_written(tmp_path: Path) -> None:
+    """A folder that the run has closed to everybody, itself included, hides what is in it; a dead link is no error."""
+    folder = volumes(tmp_path)
+    it = watch(folder)
+    hidden = folder / "notes" / "deep"
+    hidden.chmod(0)
+    try:
+        if os.access(hidden, os.R_OK):
+            pytest.skip("nothing is closed to root")
+        assert it.overrun(0.0)
+    finally:
+        hidden.chmod(0o700)
+    (folder / "maps" / "gone").symlink_to("nowhere")
+    assert not watch(folder).overrun(0.0)
+
+
+def test_without_volumes_nothing_is_watched(tmp_path: Path) -> None:
+    """No volume, or no reserve: the zygote does not wake for it."""
+    (tmp_path / "none").mkdir()
+    for it in (Disk(tmp_path / "none", reserve_mb=1), Disk(tmp_path / "not there", reserve_mb=1)):
+        assert not it.watched
+        assert not it.overrun(0.0)
+    assert not Disk(volumes(tmp_path), reserve_mb=0).watched
+
+
+def test_inodes_that_run_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk with bytes left and hardly an inode is short; one that has no bound on them is not."""
+    folder = volumes(tmp_path)
+    real = os.statvfs(folder)
+
+    def few(_: object) -> os.statvfs_result:
+        values = list(real)
+        values[5:8] = counts
+        return os.statvfs_result((*values, real.f_fsid))
+
+    monkeypatch.setattr(os, "statvfs", few)
+    it = watch(folder, reserve_mb=1)
+    (folder / "notes" / "a").write_bytes(bytes(2 * OWN_MB * 2**20))
+    counts = (0, 0, 0)
+    assert not it.overrun(0.0)
+    counts = (10**6, 100, 100)
+    assert it.overrun(10.0)
