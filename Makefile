@@ -30,7 +30,7 @@ test: ## Set up and run everything: lint, types, import contracts, unit, integra
 	scripts/whole_suite.sh tests
 
 # Types and tests take longest, and neither needs the other: at the same time.
-check: ready ## The fast part: lint, types, import contracts, unit tests with few examples of each property
+check: ready ## The fast part: lint, types, import contracts, unit tests but the long ones, with few examples of each property
 	$(MAKE) --no-print-directory lint formatted contracts READY=1
 	report=$$(mktemp); trap 'rm -f "$$report"' EXIT; failed=0; \
 	$(RUN) basedpyright --level error >"$$report" 2>&1 & types=$$!; \

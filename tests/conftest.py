@@ -29,10 +29,13 @@ FEW_EXAMPLES = 10
 """Of each property, when quick feedback is wanted (SWIFTBOT_QUICK=1, as `make check` does)."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Try fewer examples of each property where quick feedback is wanted; the whole run tries all."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Where quick feedback is wanted try fewer examples of each property, and leave out what is marked `thorough`."""
     if not os.environ.get("SWIFTBOT_QUICK"):
         return
+    thorough = [item for item in items if item.get_closest_marker("thorough")]
+    config.hook.pytest_deselected(items=thorough)
+    items[:] = [item for item in items if not item.get_closest_marker("thorough")]
     for item in items:
         test = getattr(item, "obj", None)
         chosen = getattr(test, "_hypothesis_internal_use_settings", None)

@@ -76,6 +76,7 @@ def test_the_shipped_default_beside_keep_alive_in_a_fleet(monkeypatch: pytest.Mo
     assert line[DEFAULT]["wasted_gb"] <= line["keep_alive"]["wasted_gb"]
 
 
+@pytest.mark.thorough
 def test_points_are_means_over_several_draws() -> None:
     """Two draws of a trace: runs add up, points are means; each draw's verdict, and what is possible, are there too."""
     drawn = [plain("poisson", seed=seed, rate=0.5, duration_s=1200.0) for seed in (1, 2)]

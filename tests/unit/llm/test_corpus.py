@@ -18,6 +18,8 @@ from appliance.llm.corpus.tally import tally
 from appliance.model import Subtask
 from appliance.skills.catalogue import DOMAINS, Catalogue
 
+pytestmark = pytest.mark.thorough
+
 LEAST_OF_A_SKILL = 15
 LEAST_OF_A_DOMAIN = 75
 

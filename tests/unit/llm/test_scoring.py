@@ -61,6 +61,7 @@ def damaged(plan: dict[str, Any], rng: random.Random) -> dict[str, Any]:
     return made
 
 
+@pytest.mark.thorough
 def test_it_is_the_shared_scorer_s_figures(shared: Path) -> None:
     """Of hand-written plans with things wrong at random every figure is the shared scorer's, those of no plan too."""
     theirs: Any = runpy.run_path(str(shared / "decomposition" / "score.py"))["score_case"]

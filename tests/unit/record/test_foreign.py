@@ -98,6 +98,7 @@ def test_topics_of_others_become_keys() -> None:
     assert remapped("swiftbot/demo/robot/r11/state", rules, "replay") == "swiftbot/replay/robot/r11/state"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", WRITERS)
 def test_damage_at_every_offset(tmp_path: Path, name: str) -> None:
     """Each byte of a file changed, one at a time: no crash, no message that was not written, no growing memory."""

@@ -227,6 +227,7 @@ def _recorded(folder: Path) -> Path:
     return writer.files[0]
 
 
+@pytest.mark.thorough
 def test_the_recorders_own_file_damaged_at_every_offset(tmp_path: Path) -> None:
     """A byte changed, and the file cut, at each place in turn: what is read was written, and what lacks is told."""
     whole = _recorded(tmp_path / "logs").read_bytes()

@@ -1,5 +1,6 @@
 """Counters of a link: loss by sequence numbers, latency, and how much one end may send."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -40,6 +41,7 @@ def test_a_sender_that_begins_again() -> None:
     assert (sender.lost, sender.late, sender.expected) == (0, 2, 50)
 
 
+@pytest.mark.thorough
 def test_senders_are_bounded() -> None:
     """Whatever ids a stranger invents, the table stays small and the latest are in it."""
     stats = LinkStats(0.0)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import msgspec
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,6 +23,7 @@ def record(*subtasks: tuple[str, tuple[str, ...]], **params: Any) -> TaskRecord:
     )
 
 
+@pytest.mark.thorough
 def test_what_cannot_end_is_unsound() -> None:
     """Cycles, what comes after nothing, two of one name, far too many and far too deep: each is told."""
     deep: Any = {}

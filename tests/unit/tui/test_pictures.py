@@ -21,7 +21,7 @@ from .pictures import NOW_NS, OTHER_SIZES, SIZES, characters, compare_screen, ne
 if TYPE_CHECKING:
     from .conftest import FakeView
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.thorough]
 SCREENS = {
     "fleet": ("1",),
     "gateway": ("1", "enter"),

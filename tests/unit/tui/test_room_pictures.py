@@ -19,7 +19,7 @@ from .test_review import WAITING
 if TYPE_CHECKING:
     from .conftest import FakeView
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.thorough]
 
 SCREENS = {
     "tasks": ("2", "down"),

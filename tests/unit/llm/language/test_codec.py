@@ -36,6 +36,7 @@ def test_a_plan_points_at_words() -> None:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
 def test_the_corpus_comes_back(file: Path) -> None:
     """What is written of every pair of the training corpus is read as the same plan, and its words suffice."""

@@ -52,6 +52,7 @@ def test_whatever_follows_it_is_a_plan(data: st.DataObject, instruction: str, ro
             assert subtask.robot in robots
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
 def test_the_corpus_follows_it(file: Path) -> None:
     """The plans of the corpus (each third) that need no literal may be said, with the roster they have."""

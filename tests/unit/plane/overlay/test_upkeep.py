@@ -43,6 +43,7 @@ def test_joins_alone_make_a_ring(size: int, bound: int, seed: int) -> None:
     assert all(len(upkeep.view) <= bound for upkeep in fleet.members.values())
 
 
+@pytest.mark.thorough
 @settings(max_examples=6, deadline=None)
 @given(st.integers(10, 60), st.floats(0, 0.4), st.integers(0, 10**6))
 def test_failures_heal(size: int, share: float, seed: int) -> None:

@@ -9,6 +9,8 @@ from appliance.pool.simulator.clairvoyant import Belady, cold_with_foresight, le
 from appliance.pool.simulator.simulation import REMOTE_MS, WARM_MS
 from appliance.pool.simulator.traces import plain
 
+pytestmark = pytest.mark.thorough
+
 BARE = PoolConfig(floor={}, capacity=64, memory_mb=8192, mode="local", eviction="lru", prewarm=(), keep="fixed")
 
 

@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from itertools import pairwise
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,6 +40,7 @@ def p(outcome: Outcome, part: float) -> float:
     return ordered[int(part * (len(ordered) - 1))]
 
 
+@pytest.mark.thorough
 def test_a_hundred_gateways_with_thousands_of_uneven_runs_become_balanced() -> None:
     """Those that crowd on few gateways end sooner with moves than without, and the last ones much sooner."""
     arrivals = uneven(1, runs=3000, gateways=100, over_s=60.0, work_s=4.0)
