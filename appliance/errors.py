@@ -68,6 +68,11 @@ class UnreachableError(SwiftbotError):
     code = "unreachable"
     exit_code = 3
 
+    def __init__(self, message: str, *, remedy: str = "", retry_after_s: float = 0.0, sent: bool = False) -> None:
+        super().__init__(message, remedy=remedy, retry_after_s=retry_after_s)
+        self.sent = sent
+        """Whether what was asked for may have been done: it was on its way when whoever should answer went away."""
+
 
 class DeadlineError(SwiftbotError):
     """No result within the time allowed."""

@@ -96,7 +96,7 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     searches: dict[str, int] = field(default_factory=dict[str, int])
     """How ready containers of others were looked for since it started: `asked` counts queries to other gateways,
     `saved` those that were not needed because what was known was enough, `moved` runs that waited here and were
-    passed on."""
+    passed on, `unanswered` orders to other gateways without an answer, which may have been taken."""
     limits_enforced: bool = True
     """False where the kernel's cgroups do not let rootless containers be limited."""
     pool_problem: str = ""

@@ -4,10 +4,10 @@
 
 import asyncio
 import contextlib
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import cast
 
 import structlog
 import zenoh
@@ -38,7 +38,7 @@ class Asking:
         questions that can be asked again, where the way there and back matters.
 
         Raises:
-            UnreachableError: nobody serves the key, or whoever did went away before answering.
+            UnreachableError: nobody serves the key, or (`sent`) whoever may have heard it went away before answering.
             DeadlineError: no answer within `timeout_s` seconds.
             PayloadError: the request or the answer is too large.
             SwiftbotError: what the answering side raised.
@@ -55,11 +55,10 @@ class Asking:
                 elif data is not None:
                     answer.set_result(data)
 
-        def on_end() -> None:
+        def on_end(sent: bool) -> None:
             if not answer.done():
-                answer.set_exception(
-                    UnreachableError(f"nobody answers on {key}", remedy="is that gateway or robot up and linked?")
-                )
+                remedy = "is that gateway or robot up and linked?"
+                answer.set_exception(UnreachableError(f"nobody answers on {key}", remedy=remedy, sent=sent))
 
         try:
             target = zenoh.QueryTarget.BEST_MATCHING
@@ -88,7 +87,7 @@ class Asking:
             elif error is not None:
                 log.debug("an answer is an error", expr=expr, error=str(error))
 
-        self._get(expr, payload, timeout_s, on_reply, ended.set, target=zenoh.QueryTarget.ALL)
+        self._get(expr, payload, timeout_s, on_reply, lambda _: ended.set(), target=zenoh.QueryTarget.ALL)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await ended.wait()
@@ -100,7 +99,7 @@ class Asking:
         payload: bytes,
         timeout_s: float,
         on_reply: Callable[[str, bytes | None, SwiftbotError | None], None],
-        on_end: Callable[[], None],
+        on_end: Callable[[bool], None],
         *,
         target: zenoh.QueryTarget,
         bulk: bool = False,
@@ -114,7 +113,7 @@ class Asking:
         if self._wire.closed:
             raise UnreachableError("the session is closed")
 
-        answered = False
+        answered, sender = False, 0
 
         def take(reply: zenoh.Reply) -> None:
             nonlocal answered
@@ -138,7 +137,8 @@ class Asking:
         def end() -> None:
             # Where the first answer is all that counts, waking the event loop for the end after it is for nothing.
             if not (first and answered):
-                self._wire.inbox.post(on_end, must=True)
+                # One that nobody serves ends within the call that sends it.
+                self._wire.inbox.post(partial(on_end, sender != threading.get_ident()), must=True)
 
         priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
         control = zenoh.CongestionControl
@@ -157,13 +157,20 @@ class Asking:
             attachment=meant,
             source_info=self._wire.source,
         )
+
+        def ask() -> None:
+            nonlocal sender
+            sender = threading.get_ident()
+            send()
+            sender = 0
+
         if direct:
-            link.quietly(cast("Callable[[], None]", send), expr)
+            link.quietly(ask, expr)
         else:
-            self._wire.send(expr, cast("Callable[[], None]", send), len(payload))
+            self._wire.send(expr, ask, len(payload))
 
     def stop(self) -> None:
         """End every question under way with an error."""
         for answer in self._asking:
             if not answer.done():
-                answer.set_exception(UnreachableError("the session was closed"))
+                answer.set_exception(UnreachableError("the session was closed", sent=True))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, PoolError, SwiftbotError, UnreachableError
+from appliance.errors import PoolError, SwiftbotError, UnreachableError
 from appliance.model import Phase, RunAccepted, RunRequest
 from appliance.plane.node import Plane
 from appliance.pool.pool import Pool
@@ -16,7 +16,7 @@ from appliance.pool.selection import Decision
 from appliance.pool.turns import turn_of
 from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.bounds import clean
-from appliance.tasks.passing import ORDER_S, explained, passed_on
+from appliance.tasks.passing import ORDER_S, explained, may_run, passed_on
 from appliance.tasks.remote import RemoteContainers
 
 REMOTE_TRIES = 3
@@ -64,10 +64,10 @@ class Choosing:
                 accepted = await self._plane.rpc.call(
                     gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
                 )
-            except DeadlineError as error:
-                # It may run there or not: only a new attempt, which ends this one wherever it is, is safe.
-                raise UnreachableError(f"{gateway} did not say whether it runs {request.run_id}") from error
             except SwiftbotError as error:
+                if may_run(error):
+                    remote.searches["unanswered"] += 1
+                    raise UnreachableError(f"{gateway} did not say whether it runs {request.run_id}") from error
                 # The container was taken, or was never there, or its gateway went away meanwhile.
                 remote.turned_out(sent, good=False)
                 avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}

@@ -235,17 +235,24 @@ class Elsewhere:
         self._promised.pop(run_id, None)
         self._under_way.discard(run_id)
 
-    def offered(self, run_id: str, *, taken: bool, container: str = "") -> None:
+    def offered(self, run_id: str, *, taken: bool | None, container: str = "") -> None:
         """Note what came of an offer; one that was not taken is made again after a pause.
 
         Args:
             run_id: what was offered.
-            taken: whether the other gateway has it.
+            taken: whether the other gateway has it; None: it did not say. That is neither a container that was there
+                nor one that was not: what is thought of the gateway stays, and its promised container is held no longer
+                than any.
             container: the one that it got there.
         """
         del self._offers[run_id]
         self._under_way.discard(run_id)
-        if (sent := self._promised.pop(run_id, None)) is not None:
+        sent = self._promised.pop(run_id, None)
+        if taken is None:
+            self._tries.pop(run_id, None)
+            self._remote.searches["unanswered"] += 1
+            return
+        if sent is not None:
             self._remote.turned_out(sent, good=taken, container=container)
         if taken:
             self._tries.pop(run_id, None)

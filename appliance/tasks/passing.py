@@ -108,14 +108,16 @@ class Passing:
             decision = replace(decision, container=None, reservation="")
 
     async def _pass_on(self, request: RunRequest, offer: Offer, since: float) -> PassedOn | None:
-        run_id, taken, container = request.run_id, False, ""
+        run_id, container = request.run_id, ""
+        taken: bool | None = None
         order = replace(request, hops=1, anew=offer.anew)
         try:
             accepted = await self._plane.rpc.call(offer.gateway, "run", order, RunAccepted, timeout_s=ORDER_S)
             taken, container = True, accepted.container
-        except DeadlineError as error:
-            raise UnreachableError(f"{offer.gateway} did not say whether it runs {run_id}") from error
         except SwiftbotError as error:
+            if may_run(error):
+                raise UnreachableError(f"{offer.gateway} did not say whether it runs {run_id}") from error
+            taken = False
             self._plane.session.refuse("stale offer", key=offer.gateway, run=run_id, reason=error.message)
             return None
         finally:
@@ -147,6 +149,15 @@ class Passing:
         except SwiftbotError as error:
             log.info("no word of a run that was passed on", run=run_id, gateway=there, reason=str(error))
             return RunStatus(running=there in self._plane.members())
+
+
+def may_run(error: SwiftbotError) -> bool:
+    """Whether an order to run that ended so may have been taken: it had no answer, but may have arrived.
+
+    The same attempt must not be begun in a second place then, for nothing fences the two off from each other. Only the
+    next attempt is safe, which ends this one wherever it is.
+    """
+    return isinstance(error, DeadlineError) or (isinstance(error, UnreachableError) and error.sent)
 
 
 def explained(decision: Decision, avoid: Mapping[str, str]) -> Decision:

@@ -188,6 +188,33 @@ async def test_requests_and_their_errors(pair: tuple[Session, Session]) -> None:
         server.register("need", Need, handle)
 
 
+@pytest.mark.parametrize("direct", [False, True])
+async def test_a_question_that_may_have_been_heard_is_told_from_one_that_went_nowhere(
+    pair: tuple[Session, Session], direct: bool
+) -> None:
+    """Whoever was asked goes away before it answers: it may have done it. Nobody was there: nobody has."""
+    one, other = pair
+    heard = asyncio.Event()
+
+    async def never(key: str, payload: bytes) -> bytes:
+        heard.set()
+        await asyncio.Event().wait()
+        return payload
+
+    with pytest.raises(UnreachableError) as nobody:
+        await one.query("swiftbot/f/q", b"x", timeout_s=60, direct=direct)
+    assert not nobody.value.sent
+    other.serve("swiftbot/f/q", never)
+    await _heard(one, other)
+    asking = asyncio.create_task(one.query("swiftbot/f/q", b"x", timeout_s=60, direct=direct))
+    await heard.wait()
+    # As the death of its process does: nobody is told anything.
+    await asyncio.to_thread(other._wire.raw.close)
+    with pytest.raises(UnreachableError) as gone:
+        await asking
+    assert gone.value.sent
+
+
 async def test_bad_requests_are_answered_with_the_reason(pair: tuple[Session, Session]) -> None:
     """Malformed and oversize requests get an ErrorReply of code `payload`, are counted, and reach no handler."""
     one, other = pair

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, RefusedError
+from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import (
     Choice,
     ContainerInfo,
@@ -217,13 +217,17 @@ async def test_a_run_that_is_not_taken_goes_back_to_its_place(executor: Executor
     assert told(plane, RunEventKind.SUCCEEDED)[0].gateway == "gw-1"
 
 
+@pytest.mark.parametrize("error", [DeadlineError("no answer"), UnreachableError("it went away", sent=True)])
 async def test_a_run_that_may_or_may_not_have_been_taken_is_not_begun_here(
-    executor: Executor, plane: Any, pool: Any
+    executor: Executor, plane: Any, pool: Any, error: SwiftbotError
 ) -> None:
-    """Without an answer the attempt has failed as unreachable, so that only a new one, which fences it, follows."""
+    """Without an answer the attempt has failed as unreachable, so that only a new one, which fences it, follows.
+
+    The offer was neither good nor empty: the gateway is not left out for it.
+    """
 
     async def silent(gateway: str, request: RunRequest) -> RunAccepted:
-        raise DeadlineError("no answer")
+        raise error
 
     plane.rpc.on["run"] = silent
     await executor.run(REQUEST)
@@ -234,6 +238,27 @@ async def test_a_run_that_may_or_may_not_have_been_taken_is_not_begun_here(
     assert failure is not None
     assert (failure.code, failure.retryable) == ("unreachable", True)
     assert not pool.line
+    remote = executor._choosing._remote
+    assert (remote._trust, remote._doubted, remote.searches["unanswered"]) == ({}, {}, 1)
+    assert "stale offer" not in plane.session.refused
+
+
+async def test_a_run_offered_to_a_gateway_that_nobody_reaches_waits_on_here(
+    executor: Executor, plane: Any, pool: Any
+) -> None:
+    """The order went nowhere, so nobody has taken it: the run is back in its place, and that gateway is doubted."""
+
+    async def gone(gateway: str, request: RunRequest) -> RunAccepted:
+        raise UnreachableError("nobody answers")
+
+    plane.rpc.on["run"] = gone
+    await executor.run(REQUEST)
+    await until(lambda: pool.line)
+    hear_of(plane, "gw-2")
+    await until(lambda: plane.session.refused.get("stale offer", 0) >= 1)
+    await until(lambda: pool.line)
+    assert not told(plane, RunEventKind.FAILED)
+    assert "gw-2" in executor._choosing._remote._trust
 
 
 async def test_a_run_that_is_called_off_while_it_is_offered_is_ended_where_it_went(

@@ -8,7 +8,14 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
+from appliance.errors import (
+    DeadlineError,
+    NotFoundError,
+    PayloadError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+)
 from appliance.model import (
     Attempt,
     Choice,
@@ -132,17 +139,26 @@ async def test_an_order_is_passed_on_once(executor: Executor, plane: Any, pool: 
         await executor.run(replace(REQUEST, subtask="s2", hops=1))
 
 
-async def test_a_pass_on_without_an_answer_is_not_run_here_as_well(executor: Executor, plane: Any, pool: Any) -> None:
-    """It may run there: the same attempt in two places is refused, and a new attempt left to the coordinator."""
+@pytest.mark.parametrize("error", [DeadlineError("no answer"), UnreachableError("it went away", sent=True)])
+async def test_a_pass_on_without_an_answer_is_not_run_here_as_well(
+    executor: Executor, plane: Any, pool: Any, error: SwiftbotError
+) -> None:
+    """It may run there: the same attempt in two places is refused, and a new attempt left to the coordinator.
+
+    Nothing is thought worse of the gateway: no answer is no container that was not there.
+    """
 
     async def silent(gateway: str, request: RunRequest) -> RunAccepted:
-        raise DeadlineError("no answer")
+        raise error
 
     plane.rpc.on["run"] = silent
     pool.decisions = [AWAY]
-    with pytest.raises(UnreachableError):
+    with pytest.raises(UnreachableError, match="did not say"):
         await executor.run(REQUEST)
     assert executor.running == 0
+    remote = executor._choosing._remote
+    assert (remote._trust, remote._doubted, remote.searches["unanswered"]) == ({}, {}, 1)
+    assert "stale offer" not in plane.session.refused
 
 
 async def test_a_pass_on_to_a_lost_gateway_falls_back_to_here(executor: Executor, pool: Any) -> None:
