@@ -6,6 +6,7 @@ Each side fetches for itself, so one rule serves joining, leaving, restart and r
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Sequence
+from typing import NamedTuple
 
 import structlog
 from msgspec import Struct
@@ -30,8 +31,9 @@ _PAGE = 4000
 _FETCH_BYTES = 2 * 2**20
 """Values in one answer, unless a single one is larger."""
 SEE_S = 0.7
-"""How long a member waits to see the token of the one that asks: shorter than any question lasts (also those after a
-loss, `reconcile`), or whoever is not seen would never hear so, and show its token again."""
+"""How long a member waits to see the token of the one that asks: shorter than a question lasts, or whoever is not seen
+would never hear so, and show its token again. (After a loss nobody is waited for so long, `reconcile`; whoever was
+silent is asked once more right after it.)"""
 
 
 class DigestAsk(Struct, frozen=True, omit_defaults=True):
@@ -65,6 +67,15 @@ class FetchList(Struct, frozen=True):
 
     records: tuple[Record, ...]
     more: bool = False
+
+
+class Compared(NamedTuple):
+    """What came of a comparison."""
+
+    silent: frozenset[str] = frozenset()
+    """Those of the members that did not answer, and are still there."""
+    fetched: int = 0
+    """Records that came."""
 
 
 class Comparing:
@@ -105,11 +116,11 @@ class Comparing:
     # --- asking -----------------------------------------------------------------------------------------------
 
     async def compare(
-        self, ring: Ring, members: Sequence[str], *, joining: bool = False, ask_s: float = ASK_S
-    ) -> tuple[bool, int]:
-        """Compare with these members, and fetch what they have; returns whether all answered, how many records came."""
+        self, ring: Ring, members: Sequence[str], *, joining: bool = False, within_s: float | None = None
+    ) -> Compared:
+        """Compare with these members, and fetch what they have; who has not told all `within_s` counts as silent."""
         if not members:
-            return True, 0
+            return Compared()
         mine = dict(await self._store.digests())
         shared: dict[str, dict[str, str]] = {each: {} for each in members}
         for number, (key, digest) in enumerate(mine.items()):
@@ -120,10 +131,17 @@ class Comparing:
                         shared[each][key] = digest
             if number % BREATH == BREATH - 1:
                 await asyncio.sleep(0)
-        results = await asyncio.gather(
-            *(self._pull(each, mine, shared[each], joining=joining, ask_s=ask_s) for each in members)
-        )
-        return all(fetched is not None for fetched in results), sum(fetched or 0 for fetched in results)
+        pulls = {asyncio.create_task(self._pull(each, mine, shared[each], joining=joining)): each for each in members}
+        try:
+            done, late = await asyncio.wait(pulls, timeout=within_s)
+        finally:
+            for pull in pulls:
+                pull.cancel()
+        for pull in late:
+            log.warning("a member takes too long to compare with", member=pulls[pull], waited_s=within_s)
+        results = {pulls[pull]: pull.result() for pull in done}
+        silent = frozenset(each for each in members if results.get(each) is None)
+        return Compared(silent & self._membership.members, sum(each or 0 for each in results.values()))
 
     async def sees(self, name: str) -> None:
         """Ask one that counts as lost whether it is there after all; one that does not see this gateway is told.
@@ -137,12 +155,10 @@ class Comparing:
             if answer.unseen:
                 self._membership.show_again()
 
-    async def _pull(
-        self, member: str, mine: dict[str, str], shared: dict[str, str], *, joining: bool, ask_s: float
-    ) -> int | None:
+    async def _pull(self, member: str, mine: dict[str, str], shared: dict[str, str], *, joining: bool) -> int | None:
         """Fetch what a member has and this gateway lacks; returns how many records, None when it did not answer."""
         try:
-            fetched = await self._pull_from(member, mine, shared, joining=joining, ask_s=ask_s)
+            fetched = await self._pull_from(member, mine, shared, joining=joining)
         except SwiftbotError as error:
             if member in self._membership.members:
                 log.warning("could not compare with a member", member=member, reason=str(error))
@@ -152,29 +168,27 @@ class Comparing:
             log.info("fetched records", member=member, records=fetched)
         return fetched
 
-    async def _pull_from(
-        self, member: str, mine: dict[str, str], shared: dict[str, str], *, joining: bool, ask_s: float
-    ) -> int:
+    async def _pull_from(self, member: str, mine: dict[str, str], shared: dict[str, str], *, joining: bool) -> int:
         asked = DigestAsk(asker=self._gateway, summary=summary(shared), joining=joining)
         fetched = 0
         while True:
-            answer = await self._rpc.call(member, "dht_digest", asked, DigestList, timeout_s=ask_s)
+            answer = await self._rpc.call(member, "dht_digest", asked, DigestList, timeout_s=ASK_S)
             if answer.unseen:
                 self._membership.show_again()
                 raise RefusedError(f"{member} does not see {self._gateway}", remedy="are the two linked?")
             if answer.same:
                 return fetched
             wanted = [key for key, each in answer.digests.items() if mine.get(key) != each]
-            fetched += await self._fetch(member, wanted, ask_s)
+            fetched += await self._fetch(member, wanted)
             if not answer.more or not answer.digests:
                 return fetched
             asked = DigestAsk(asker=self._gateway, after=max(answer.digests), joining=joining)
 
-    async def _fetch(self, member: str, keys: list[str], ask_s: float) -> int:
+    async def _fetch(self, member: str, keys: list[str]) -> int:
         done = 0
         while keys:
             page = keys[:_PAGE]
-            answer = await self._rpc.call(member, "dht_fetch", FetchAsk(tuple(page)), FetchList, timeout_s=ask_s)
+            answer = await self._rpc.call(member, "dht_fetch", FetchAsk(tuple(page)), FetchList, timeout_s=ASK_S)
             for record in answer.records:
                 check_record(record, max_bytes=self._config.max_record_bytes)
             await asyncio.gather(*(self._keep(record) for record in answer.records))

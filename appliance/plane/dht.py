@@ -9,6 +9,7 @@ the membership differ for a moment, or a partition) make concurrent versions, wh
 import asyncio
 import contextlib
 import random
+import time
 import uuid
 from collections.abc import Callable
 from functools import partial
@@ -17,6 +18,7 @@ import structlog
 
 from appliance.errors import ConflictError, DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
+from appliance.plane.absence import Absence
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, StoreAsk, Written
 from appliance.plane.pulse import Pulse
@@ -47,8 +49,12 @@ _ATTEMPT_S = 1.5
 """One try at an owner: longer than it waits for its replicas, shorter than the whole write."""
 _AGAIN_S = 0.03
 """Between tries while the membership settles."""
+_APART_S = 1.0
+"""How long a reader asks again when whoever it takes for a key's owner says that the key is another's."""
 _SETTLE_S = 2.0
 """How long an owner lets requests wait for its reconciling; then it answers with what it has."""
+_MOST_NAMED = 5
+"""Gateways named in an error."""
 
 
 class Dht:
@@ -80,6 +86,7 @@ class Dht:
         self.returned: frozenset[str] = frozenset()
         """Members that were away and have come back, with whom the shard is not compared yet: on the other side of a
         cut they may have ordered writes."""
+        self.absence = Absence(replicas=config.replicas, whole=config.view == "full")
         self._stalls = 0
         self._settled = Ring((), virtual_nodes=config.virtual_nodes)
         self._settling = asyncio.Condition()
@@ -98,37 +105,61 @@ class Dht:
     async def read(self, key: str, *, quorum: bool = False, replica: bool = False) -> Record | None:
         """Return a record from its owner or, when that does not answer, the next replica; None: there is none.
 
+        That there is none only the key's owner knows, and only when it has heard all that may have a copy: what a
+        replica lacks the owner may have, which was slow to tell.
+
         `quorum`: as a majority of the key's voters has it, so that no write with a quorum that was acknowledged
         before is missed (linearizable, `plane.quorum`).
         `replica`: as this gateway has it if it holds a copy, else as any of those that do; it may be behind.
 
         Raises:
-            UnreachableError: none of the replicas answered; `quorum`: fewer than a majority of the voters.
+            UnreachableError: whoever answered has none, and others may have one; `quorum`: fewer than a majority of the
+                voters answered.
             ConfigError: `quorum`, and no voters are configured.
         """
         check_key(key)
         if quorum:
             chosen = await self._voting.read(key)
             return None if chosen is None or chosen.deleted else chosen
-        problem: SwiftbotError | None = None
+        loop = asyncio.get_running_loop()
+        until = loop.time() + _APART_S
+        while True:
+            found, apart = await self._ask_holders(key, replica=replica)
+            if found.record is not None or not found.unsure:
+                return None if found.record is None or found.record.deleted else found.record
+            if not apart or loop.time() > until:
+                raise UnreachableError(
+                    f"whether there is a record {key} is not known: {found.unsure}", remedy="try again in a second"
+                )
+            await asyncio.sleep(_AGAIN_S)
+
+    async def _ask_holders(self, key: str, *, replica: bool) -> tuple[Found, bool]:
+        """Ask the holders of a key one after the other, until one has it or knows that there is none.
+
+        Returns:
+            What was found, and whether the first of them says that the key is another's: views differ for a moment.
+        """
         holders = list(await self._membership.holders(key, self._config.replicas))
+        owner, problems, apart = holders[0], dict[str, str](), False
         if replica:
             random.shuffle(holders)
             holders.sort(key=lambda name: name != self._gateway)
         for gateway in holders:
             try:
                 if gateway == self._gateway:
-                    record = await self._store.record(key) if replica else (await self._on_read(KeyAsk(key))).record
+                    found = await (self._copy(key) if replica else self._on_read(KeyAsk(key)))
                 else:
                     found = await self._rpc.call(
                         gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S, direct=True
                     )
-                    record = found.record
             except (UnreachableError, DeadlineError, RefusedError) as error:
-                problem = error
+                problems[gateway] = str(error)
                 continue
-            return None if record is None or record.deleted else record
-        raise UnreachableError(f"no replica of {key} answers: {problem}", remedy="try again in a second")
+            if found.record is not None or not found.unsure:
+                return found, False
+            if gateway == owner:
+                problems[gateway], apart = found.unsure, bool(found.owner)
+        return Found(unsure=problems.get(owner) or "its owner was not asked"), apart
 
     async def write(
         self,
@@ -281,19 +312,34 @@ class Dht:
     # --- answering --------------------------------------------------------------------------------------------
 
     async def _on_read(self, asked: KeyAsk) -> Found:
-        check_key(asked.key)
-        if self.owns(asked.key):
-            await self._until_settled(asked.key)
-        return Found(await self._store.record(asked.key))
+        key, unsure = check_key(asked.key), ""
+        if self.owns(key) and not await self._until_settled(key):
+            unsure = f"{self._gateway} owns it and has not compared its copies with the others' yet"
+        record = await self._store.record(key)
+        if record is not None:
+            return Found(record)
+        if not self.owns(key):
+            return Found(unsure=f"it is not {self._gateway}'s", owner=self._membership.ring.owner(key))
+        if not unsure and (doubt := self.absence.doubt(key, time.monotonic())):
+            unsure = f"{', '.join(doubt[:_MOST_NAMED])} may have it and did not answer"
+        return Found(unsure=unsure)
+
+    async def _copy(self, key: str) -> Found:
+        """The copy that is here, whoever the owner is."""
+        record = await self._store.record(key)
+        return Found(record) if record is not None else await self._on_read(KeyAsk(key))
 
     def _read_at_once(self, asked: KeyAsk, answer: AtOnce) -> bool:
-        """Answer a read on Zenoh's thread, where the ring is known whole and the record is in memory."""
+        """Answer a read on Zenoh's thread, where the ring is known whole and the record is in memory.
+
+        Whether there is none is for the event loop to say: it knows who was not heard.
+        """
         if self._config.view != "full" or (self._membership.owns(check_key(asked.key)) and not self._mine(asked.key)):
             return False
-        known, record = self._store.look(asked.key)
-        if known:
+        _, record = self._store.look(asked.key)
+        if record is not None:
             answer(Found(record))
-        return known
+        return record is not None
 
     def _store_at_once(self, asked: StoreAsk, answer: AtOnce) -> bool:
         """Have the store's thread keep a record and answer, without a turn of the event loop."""
@@ -360,16 +406,22 @@ class Dht:
             return False
         return not self.returned or self.returned.isdisjoint(self._replicas(key))
 
-    async def _until_settled(self, key: str) -> None:
-        """Wait until this gateway has reconciled as the key's owner; it may have become that just now."""
+    async def _until_settled(self, key: str) -> bool:
+        """Wait until this gateway has reconciled as the key's owner, which it may have become just now.
+
+        Returns:
+            Whether it has; False after `_SETTLE_S`: then it goes on with what it has.
+        """
         if self._mine(key):
-            return
+            return True
         self.on_wanted()
         try:
             async with asyncio.timeout(_SETTLE_S), self._settling:
                 await self._settling.wait_for(partial(self._mine, key))
         except TimeoutError:
             log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
+            return False
+        return True
 
     async def close(self) -> None:
         """Give up what is still being pushed."""

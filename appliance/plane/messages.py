@@ -13,9 +13,13 @@ class KeyAsk(Struct, frozen=True):
 
 
 class Found(Struct, frozen=True, omit_defaults=True):
-    """Answer with a record, or that there is none."""
+    """Answer with a record, or that there is none here."""
 
     record: Record | None = None
+    unsure: str = ""
+    """Where there is none: why there may be one elsewhere. Empty: there is none."""
+    owner: str = ""
+    """Where there is none and the key is another's, as the asked one sees the ring: whose."""
 
 
 class StoreAsk(Struct, frozen=True, omit_defaults=True):

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import structlog
 
-from appliance.plane.comparing import ASK_S, Comparing
+from appliance.plane.absence import GONE_S
+from appliance.plane.comparing import Comparing
 from appliance.plane.dht import Dht
 from appliance.plane.handover import HandOver
 from appliance.plane.membership import Membership
@@ -27,8 +28,10 @@ from appliance.plane.store import Store
 
 log = structlog.get_logger(__name__)
 
-LOSS_ASK_S = 1.0
-"""One question while somebody waits for a lost member's keys: all that are asked see this gateway already."""
+LOSS_S = 0.5
+"""How long a lost member's keys wait for all who may have something newer of them. With the writes that follow, which
+wait `replica_timeout_s` for the same silent member, its tasks are taken over within a second of its loss being noticed.
+Whoever has not told by then is asked again at once, and what it has is news."""
 _AGAIN_S = 1.0
 """After a member could not be compared with."""
 _SOON_S = 0.1
@@ -40,14 +43,12 @@ _ARRIVAL_S = (0.1, 0.3)
 ask it at one moment. Several that come at once are one step."""
 _ARRIVALS = 500.0
 """And longer by one second for so many members: the more there are, the more come at once."""
-_LOST_S = 600.0
-"""How long a member that was lost is asked whether it is there after all."""
 
 
 class _Done(NamedTuple):
-    heard: bool
+    heard: bool = True
     """Whether all that were asked have answered."""
-    handed: bool
+    handed: bool = True
     """Whether nothing is here any more that belongs elsewhere."""
     fetched: int = 0
 
@@ -77,7 +78,7 @@ class Reconciler:
         self._hurry = asyncio.Event()
         """Something has happened that a round under way may have to be given up for."""
         self._lost: dict[str, float] = {}
-        """Member that was lost -> until when it is asked whether it is there after all."""
+        """Member that was lost -> until when it is asked whether it is there after all, for as long as that counts."""
         self._lost_at: float | None = None
         """When the first member was lost that the shard is not settled without."""
         self._running: asyncio.Task[None] | None = None
@@ -101,7 +102,8 @@ class Reconciler:
     def _on_lost(self, name: str) -> None:
         self._dht.returned -= {name}
         now = time.monotonic()
-        self._lost[name] = now + _LOST_S
+        self._lost[name] = now + GONE_S
+        self._dht.absence.lost(name, now)
         self._lost_at = now if self._lost_at is None else self._lost_at
         self._changed.set()
         self._hurry.set()
@@ -130,7 +132,7 @@ class Reconciler:
             waited = False
             if step.kind in (Kind.LOSS, Kind.ARRIVAL) and not step.asked:
                 # Others' keys moved. What may have to be handed over waits until a burst of such news is over.
-                settled = await self._settle(step, _Done(heard=True, handed=True))
+                settled = await self._settle(step, _Done())
                 tries, tidy = 0, True
                 wait_s = _AGAIN_S if step.ring == self._membership.ring else 0.0
                 continue
@@ -139,6 +141,8 @@ class Reconciler:
             except Exception:  # supervision boundary: repair must go on whatever one round ran into
                 log.exception("reconciling failed")
                 done = _Done(heard=False, handed=False)
+                if step.kind is not Kind.REST:
+                    self._dht.absence.asked(step.asked, self._membership.members & frozenset(step.asked))
             if done is None:
                 tries, wait_s = 0, 0.0
                 continue
@@ -152,7 +156,7 @@ class Reconciler:
                     self._tell(self._dht.on_ring_change)
                 continue
             tries += 1
-            if not done.heard and tries < _TRIES:
+            if not done.heard and tries < _TRIES and step.kind is not Kind.LOSS:
                 wait_s = _SOON_S
                 continue
             if step.stalls == self._pulse.stalls:
@@ -172,17 +176,25 @@ class Reconciler:
                 each.cancel()
 
     async def _round(self, step: Step, *, tidy: bool) -> _Done:
+        absence = self._dht.absence
         if step.kind is not Kind.REST:
-            ask_s = LOSS_ASK_S if step.kind is Kind.LOSS else ASK_S
-            heard, fetched = await self._comparing.compare(step.ring, step.asked, ask_s=ask_s)
-            return _Done(heard, handed=True, fetched=fetched)
-        heard, fetched = await self._comparing.compare(step.ring, () if tidy else step.asked)
-        handed = await self._hand_over.run(step.ring)
+            # A member that is silent already is not waited for again while somebody waits for a lost one's keys.
+            loss = step.kind is Kind.LOSS
+            asked = [each for each in step.asked if not (loss and each in absence.silent)]
+            compared = await self._comparing.compare(step.ring, asked, within_s=LOSS_S if loss else None)
+            absence.asked(asked, compared.silent)
+            return _Done(heard=absence.silent.isdisjoint(step.asked), fetched=compared.fetched)
+        asked = sorted({*(() if tidy else step.asked), *(absence.silent & step.ring.members)})
+        compared = await self._comparing.compare(step.ring, asked)
+        absence.heard(set(asked) - compared.silent)
         now = time.monotonic()
+        if not tidy and not compared.silent and step.ring == self._membership.ring:
+            absence.calm(step.ring, now)
+        handed = await self._hand_over.run(step.ring)
         members = self._membership.members
         self._lost = {name: until for name, until in self._lost.items() if until > now and name not in members}
         await asyncio.gather(*(self._comparing.sees(name) for name in self._lost))
-        return _Done(heard, handed, fetched)
+        return _Done(not compared.silent, handed, compared.fetched)
 
     async def _unless_urgent(self, work: Coroutine[Any, Any, _Done], step: Step) -> _Done | None:
         """Do a round; None when it was given up for something that cannot wait for it."""
@@ -206,6 +218,7 @@ class Reconciler:
     async def _settle(self, step: Step, done: _Done) -> Settled:
         settled = self._steps.settled(step)
         self._dht.returned -= step.ring.members
+        self._dht.absence.settled(step.ring)
         await self._dht.settled(step.ring, step.stalls)
         fields: dict[str, Any] = {}
         if step.kind is Kind.LOSS and self._lost_at is not None:

@@ -11,7 +11,7 @@ import contextlib
 
 import structlog
 
-from appliance.errors import ConflictError, PayloadError, SwiftbotError
+from appliance.errors import ConflictError, PayloadError, SwiftbotError, UnreachableError
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.tasks import checkpoints
@@ -95,7 +95,10 @@ class Retention:
         return orphaned
 
     async def _needed(self, task: str, *, ended: bool) -> bool:
-        stored = await self._plane.dht.read(f"task/{task}")
+        try:
+            stored = await self._plane.dht.read(f"task/{task}")
+        except UnreachableError:
+            return True  # whoever has its record may only be away
         if stored is None or not ended:
             return stored is not None
         try:

@@ -14,8 +14,9 @@ import msgspec
 import structlog
 from msgspec.structs import replace
 
-from appliance.errors import ConflictError, NotFoundError, RefusedError, SwiftbotError
+from appliance.errors import ConflictError, NotFoundError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import Lease, RobotCommand, RobotReply, encode
+from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer
 from appliance.robots.authority.api import DriveAsk, GiveAsk, RenewAsk, TakeAsk
@@ -100,7 +101,12 @@ class Leasing:
             if held.id == lease.id:
                 return held
             raise self._taken(held)
-        stored = await self._plane.dht.read(_key(ask.robot))
+        try:
+            stored = await self._plane.dht.read(_key(ask.robot))
+        except UnreachableError as error:
+            # Whoever may have it does not answer: an operator must not wait for that. Where it turns up, it conflicts.
+            log.warning("robot taken over unread", robot=ask.robot, reason=str(error))
+            stored = None
         known = _read(stored.value) if stored is not None and not stored.deleted else None
         if known is not None and not known.ended and known.id != lease.id:
             # Not heard of here yet, or lost with the gateway that was asked: it holds as long as it says from now on.
@@ -108,21 +114,32 @@ class Leasing:
             if (held := self.leases.of(ask.robot)) is not None:
                 raise self._taken(held)
         if known is None or known.id != lease.id:
-            try:
-                expected = stored.version if stored is not None else None
-                await self._plane.dht.write(_key(ask.robot), encode(lease), expected=expected)
-            except ConflictError:
-                again = await self._plane.dht.read(_key(ask.robot))
-                winner = _read(again.value) if again is not None else None
-                if winner is not None and not winner.ended:
-                    self._hear(winner)
-                    raise self._taken(winner) from None
-                raise
+            await self._write_taken(lease, stored)
         self._hear(lease)
         self._plane.session.put(self._plane.keys.lease(lease.robot), encode(lease))
         log.warning("robot taken over", robot=lease.robot, by=lease.by, why=lease.why, lease_s=lease.lease_s)
         await self._have_hold(lease.robot, lease.id)
         return lease
+
+    async def _write_taken(self, lease: Lease, stored: Record | None) -> None:
+        """Write a lease over what was read; ConflictError says who was faster."""
+        for again in (True, False):
+            try:
+                await self._plane.dht.write(
+                    _key(lease.robot), encode(lease), expected=stored.version if stored is not None else None
+                )
+            except ConflictError:
+                stored = await self._plane.dht.read(_key(lease.robot))
+                winner = _read(stored.value) if stored is not None else None
+                if winner is not None and winner.id == lease.id:
+                    return
+                if winner is not None and not winner.ended:
+                    self._hear(winner)
+                    raise self._taken(winner) from None
+                if not again:
+                    raise
+            else:
+                return
 
     async def renew(self, ask: RenewAsk) -> Lease:
         """Answer `control_renew`; ConflictError when the lease has ended, or is about to since its time is over."""

@@ -20,6 +20,7 @@ from appliance.errors import (
     PayloadError,
     RefusedError,
     SwiftbotError,
+    UnreachableError,
 )
 from appliance.model import Enquiry, encode
 from appliance.plane.dht import Record
@@ -97,7 +98,8 @@ class Enquiries:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(min(LOOK_S, left_s)):
                         await heard.wait()
-                now = await self._read(enquiry.id) or now
+                with contextlib.suppress(UnreachableError):  # whoever has it may be back before the time is over
+                    now = await self._read(enquiry.id) or now
         except asyncio.CancelledError:
             task = asyncio.create_task(self._withdraw(enquiry.id), name=f"withdraw {enquiry.id}")
             self._closing.add(task)

@@ -7,13 +7,13 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from appliance.plane.comparing import SEE_S
+from appliance.plane.comparing import ASK_S, SEE_S
 from appliance.plane.keys import Keys
 from appliance.plane.membership import Membership
 from appliance.plane.node import Plane
 from appliance.plane.outlived import MOST_ASKED, REST_S, Outlived
 from appliance.plane.pulse import Pulse, Standstill
-from appliance.plane.reconcile import LOSS_ASK_S
+from appliance.plane.reconcile import LOSS_S
 from appliance.plane.settings import PlaneConfig
 
 pytestmark = pytest.mark.anyio
@@ -206,5 +206,10 @@ def test_membership_knows_since_when_a_token_was_seen(monkeypatch: pytest.Monkey
 
 
 def test_whoever_is_not_seen_hears_so_before_its_question_ends() -> None:
-    """Otherwise a token that was forgotten is never shown again while somebody waits for a lost member's keys."""
-    assert SEE_S < LOSS_ASK_S
+    """Otherwise a token that was forgotten is never shown again."""
+    assert SEE_S < ASK_S
+
+
+def test_a_silent_member_leaves_a_takeover_its_second() -> None:
+    """Who takes over waits for it twice: when it compares its copies, and when it writes that it has taken over."""
+    assert LOSS_S + PlaneConfig().replica_timeout_s < 1.0

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.errors import UnreachableError
 from appliance.model import TaskRecord, TaskState
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
@@ -42,6 +43,8 @@ class Records:
 
     async def read(self, key: str) -> Record | None:
         """One record."""
+        if "away" in key:
+            raise UnreachableError("whoever may have it did not answer")
         return self.kept.get(key)
 
     async def remove(self, key: str, *, expected: dict[str, int]) -> None:
@@ -90,3 +93,14 @@ async def test_checkpoints_of_ended_tasks_are_forgotten() -> None:
     plane = cast("Plane", SimpleNamespace(dht=records))
     assert await Retention(plane, TasksConfig()).round() == 2
     assert [key for key in records.kept if key.startswith("checkpoint/")] == ["checkpoint/runs/s1"]
+
+
+async def test_what_belongs_to_a_task_that_cannot_be_looked_up_stays() -> None:
+    """Whoever has its record may only be away; what belongs to others is forgotten all the same."""
+    records = Records()
+    for task in ("away", "gone"):
+        records.put(f"effect/{task}/s1/1")
+        records.put(f"checkpoint/{task}/s1")
+    plane = cast("Plane", SimpleNamespace(dht=records))
+    assert await Retention(plane, TasksConfig()).round() == 2
+    assert sorted(records.kept) == ["checkpoint/away/s1", "effect/away/s1/1"]

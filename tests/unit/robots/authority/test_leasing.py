@@ -5,10 +5,12 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any, cast
 
+import msgspec
 import pytest
 
-from appliance.errors import ConflictError, RefusedError
-from appliance.model import Lease, RobotCommand
+from appliance.errors import ConflictError, RefusedError, UnreachableError
+from appliance.model import Lease, RobotCommand, encode
+from appliance.plane.dht import Record
 from appliance.robots.authority import leasing as module
 from appliance.robots.authority.api import DriveAsk, RenewAsk, TakeAsk
 from appliance.robots.authority.leasing import Leasing
@@ -141,3 +143,37 @@ async def test_what_breaks_does_not_keep_leases_from_ending(plane: FakePlane, le
     over(leasing)
     await until(lambda: leasing.leases.of("r1") is None)
     assert len(broke) > 1
+
+
+async def test_a_robot_is_taken_over_though_nobody_knows_whether_somebody_has_it(
+    plane: FakePlane, leasing: Leasing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever holds the record is away: the robot is had all the same, and a lease that turns up there is heeded."""
+    reads: list[str] = []
+    read = plane.read
+
+    async def away(key: str) -> Record | None:
+        reads.append(key)
+        if len(reads) == 1:
+            raise UnreachableError("gw-2 may have it and did not answer")
+        return await read(key)
+
+    async def write(key: str, value: bytes, *, expected: dict[str, int] | None) -> dict[str, int]:
+        known = plane.records.get(key)
+        if (known.version if known is not None else None) != expected:
+            raise ConflictError("it has moved on")
+        plane.records[key] = Record(key=key, value=value, version={"gw-1": 9})
+        return {"gw-1": 9}
+
+    monkeypatch.setattr(plane, "read", away)
+    monkeypatch.setattr(plane, "write", write)
+    ended = Lease(id="o-1", robot="r1", by="bob", ended="given back")
+    plane.records["lease/r1"] = Record(key="lease/r1", value=encode(ended), version={"gw-2": 1})
+    lease = await leasing.take(TakeAsk(robot="r1", by="ann"))
+    assert msgspec.json.decode(plane.records["lease/r1"].value, type=Lease).id == lease.id
+    plane.robot("r2")
+    reads.clear()
+    held = Lease(id="o-2", robot="r2", by="bob", lease_s=30.0)
+    plane.records["lease/r2"] = Record(key="lease/r2", value=encode(held), version={"gw-2": 1})
+    with pytest.raises(ConflictError, match="bob"):
+        await leasing.take(TakeAsk(robot="r2", by="ann"))

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.errors import ConflictError, DeadlineError, NotFoundError, PayloadError, RefusedError
+from appliance.errors import ConflictError, DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
 from appliance.model import Enquiry, encode
 from appliance.tasks.steering import enquiries as module
 from appliance.tasks.steering.api import AnswerAsk, EnquiriesAsk
@@ -118,3 +118,22 @@ def test_an_answer_outlives_a_partition() -> None:
 
 def _fields(enquiry: Enquiry) -> dict[str, Any]:
     return {name: getattr(enquiry, name) for name in enquiry.__struct_fields__}
+
+
+async def test_a_question_waits_on_while_its_record_cannot_be_read(
+    asking: Enquiries, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever has the record is silent for a while: the handler goes on waiting, and gets the answer given later."""
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    task, _ = await asked(asking, question(expires_s=300.0))
+    silent, read = asyncio.Event(), plane.dht.read
+
+    async def away(key: str) -> Any:
+        silent.set()
+        raise UnreachableError("gw-2 may have it and did not answer")
+
+    monkeypatch.setattr(plane.dht, "read", away)
+    await asyncio.wait_for(silent.wait(), 60)
+    monkeypatch.setattr(plane.dht, "read", read)
+    await asking.answer(AnswerAsk(id="t:s1:1", answer="yes", by="ann"))
+    assert (await asyncio.wait_for(task, 60)).answer == "yes"
