@@ -86,9 +86,9 @@ async def test_restarts(how: str) -> None:
 @pytest.mark.podman
 async def test_takeovers(built: None) -> None:
     """Tasks of a coordinator that is killed, and of one that is frozen, are adopted, and end exactly once."""
-    options = takeover.Options(gateways=3, kills=1, freezes=1, tasks=4, sleep_ms=2000)
+    options = takeover.Options(gateways=4, kills=1, freezes=1, silents=1, tasks=4, sleep_ms=2000)
     result = await takeover.run(options, progress=lambda _: None)
-    for how in ("kill", "freeze"):
+    for how in ("kill", "freeze", "silent"):
         assert result[how]["tasks"] == 4
         assert result[how]["tasks_taken_over"] >= 1
         assert result[how]["not_exactly_once"] == []

@@ -435,6 +435,32 @@ async def test_a_request_waits_until_whoever_has_come_back_was_compared_with(
     assert not one.dht.returned
 
 
+async def test_a_removal_is_remembered_for_its_time_everywhere(
+    tmp_path: Path, free_ports: Callable[..., list[int]]
+) -> None:
+    """Until then no old copy brings the record back; then every replica forgets it, and a new one is new."""
+    async with _fleet_of(tmp_path, free_ports(3), anti_entropy_s=0.1) as fleet:
+        for number in range(3):
+            await fleet.start(number)
+        await fleet.settled()
+        planes = list(fleet.planes.values())
+        version = await planes[0].dht.write("task/1", b"v", expected=None)
+        await planes[0].dht.remove("task/1", expected=version)
+        old = Record(key="task/1", value=b"v", version=version, write="w")
+        for plane in planes:
+            kept = await plane.dht.keep(old)
+            assert kept.deleted
+            # It keeps it from now on for no time at all.
+            tidying = plane._reconciler._hand_over
+            tidying._config = msgspec.structs.replace(tidying._config, tombstone_hours=0.0)
+        for plane in planes:
+            while await plane.store.record("task/1") is not None:
+                plane._reconciler._changed.set()
+                await asyncio.sleep(0.02)
+        assert await planes[1].dht.read("task/1") is None
+        assert set(await planes[1].dht.write("task/1", b"new", expected=None)) == set(version)
+
+
 async def test_a_write_meant_for_another_is_refused(fleet: Fleet) -> None:
     """A gateway that does not own a key does not order its writes: it names the owner."""
     key = fleet.owned_by(1)

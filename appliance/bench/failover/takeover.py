@@ -1,10 +1,13 @@
 """Gateways that coordinate running tasks are killed, and frozen: how soon it is noticed, and who goes on.
 
 A killed process is noticed by its connections, at once; a frozen one (SIGSTOP, a machine that hangs) by its silence,
-after `plane.lease_ms`. Survivors say in their logs when they lost it, and the successor when the record is written by
-which it drives the task: a client that was linked to the lost one hears nothing at just that moment. In the end each
-task must have succeeded, each subtask must have ended exactly once, and where two coordinators have told of one end
-both must have the same record once they have met.
+after `plane.lease_ms`. The third way is a kill while another gateway, which has copies of the tasks and takes none of
+them over, is frozen: the successors see that one and hear nothing of it, and must not wait for long.
+
+Survivors say in their logs when they lost a gateway, and the successor when the record is written by which it drives
+the task: a client that was linked to the lost one hears nothing at just that moment. In the end each task must have
+succeeded, each subtask must have ended exactly once, and where two coordinators have told of one end both must have the
+same record once they have met.
 """
 
 import asyncio
@@ -27,15 +30,18 @@ from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError
 from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.surroundings import task_key
 
 STEP_S = 120.0
 MEET_S = 10.0
 """For how long two coordinators that have both told of a run's end may still have different records of its task."""
 GOAL_MS = 1000.0
+COPIES = PlaneConfig().replicas
 _PARAMETER = """
 retries = 5
 
@@ -51,6 +57,8 @@ class Options(Struct, frozen=True, kw_only=True):
     gateways: int = 8
     kills: int = 10
     freezes: int = 5
+    silents: int = 3
+    """Kills while another holder of the tasks' records is frozen."""
     tasks: int = 8
     """Under way at the same time, of two subtasks each."""
     sleep_ms: float = 3000.0
@@ -112,6 +120,14 @@ class Heard:
         """Listen no more."""
         for closer in self._closers:
             closer.close()
+
+
+def holder_without_a_part(ring: Ring, victim: str, tasks: Sequence[str]) -> str:
+    """A gateway with copies of these tasks that takes none of them over from the victim; "": there is none."""
+    left = ring.without_member(victim)
+    heirs = {left.owner(task_key(task)) for task in tasks}
+    holders = Counter(name for task in tasks for name in left.successors(task_key(task), COPIES) if name not in heirs)
+    return min(holders, key=lambda name: (-holders[name], name), default="")
 
 
 async def apart(
@@ -192,11 +208,12 @@ def adoptions(lines: Mapping[str, Sequence[dict[str, Any]]], victim: str) -> dic
 
 
 async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
-    """Measure kills, then freezes; all processes and containers are gone afterwards.
+    """Measure kills, then freezes, then kills with a silent member; all processes and containers are gone afterwards.
 
     Returns:
-        For `kill` and `freeze`: `detected` by the successor and `detected_by_all`, ms after the signal; `adopted`, ms
-        after the successor's detection, and the parts of that (`settled`, `taken_up`, `written`); and counts of tasks.
+        For `kill`, `freeze` and `silent`: `detected` by the successor and `detected_by_all`, ms after the signal;
+        `adopted`, ms after the successor's detection, and the parts of that (`settled`, `taken_up`, `written`); and
+        counts of tasks.
     """
     result: dict[str, Any] = {"gateways": options.gateways, "lease_ms": options.lease_ms, "goal_ms": GOAL_MS}
     with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
@@ -219,6 +236,8 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
                     result["kill"] = await rounds.run("kill", options.kills)
                 if options.freezes:
                     result["freeze"] = await rounds.run("freeze", options.freezes)
+                if options.silents:
+                    result["silent"] = await rounds.run("silent", options.silents)
         finally:
             await arena.stop(progress=progress)
     return result
@@ -232,7 +251,7 @@ class _Rounds:
         self._clients = clients
         self._progress = progress
 
-    async def run(self, how: Literal["kill", "freeze"], rounds: int) -> dict[str, Any]:
+    async def run(self, how: Literal["kill", "freeze", "silent"], rounds: int) -> dict[str, Any]:
         """Lose so many coordinators, one after the other."""
         heard = Heard(self._clients)
         detected: list[float] = []
@@ -248,16 +267,19 @@ class _Rounds:
             roots = Counter(each.coordinator for each in records)
             victim = roots.most_common(1)[0][0]
             theirs = [each.id for each in records if each.coordinator == victim]
+            mute = holder_without_a_part(self._client.plane.ring, victim, theirs) if how == "silent" else ""
             tails = {
                 name: LogTail(self._arena.directory / "logs" / f"{name}.log")
                 for name in self._arena.names
-                if name != victim
+                if name not in (victim, mute)
             }
+            if mute:
+                self._arena.signal(mute, signal.SIGSTOP)
             at = time.time()
-            if how == "kill":
-                await self._arena.kill(victim)
-            else:
+            if how == "freeze":
                 self._arena.signal(victim, signal.SIGSTOP)
+            else:
+                await self._arena.kill(victim)
             lost = await self._lost(tails, victim)
             by_all.append((max(lost.values()) - at) * 1e3)
             for each in (await self._adopted(tails, theirs, victim)).values():
@@ -267,15 +289,17 @@ class _Rounds:
                 for part, took_ms in each.parts(seen_at).items():
                     parts[part].append(took_ms)
             self._progress(
-                f"{how} {number + 1} of {rounds}: {victim} with {len(theirs)} tasks, seen after {by_all[-1]:.0f} ms, "
+                f"{how} {number + 1} of {rounds}: {victim} with {len(theirs)} tasks"
+                f"{f', {mute} silent' if mute else ''}, seen after {by_all[-1]:.0f} ms, "
                 f"adopted {adopted[-1]:.0f} ms later"
             )
-            if how == "freeze":
-                self._arena.signal(victim, signal.SIGCONT)
+            for each in (victim if how == "freeze" else "", mute):
+                if each:
+                    self._arena.signal(each, signal.SIGCONT)
             problems += await self._ended(heard, names)
             told_twice += heard.told_twice(names)
             tasks += len(names)
-            if how == "kill":
+            if how != "freeze":
                 self._arena.start(victim)
             await self._arena.settled(self._client, ready=0)
             problems += await apart(heard.tellers(names), self._record)

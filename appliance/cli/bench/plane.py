@@ -136,6 +136,7 @@ def takeover(
     gateways: int = 8,
     kills: int = 10,
     freezes: int = 5,
+    silents: int = 3,
     tasks: int = 8,
     sleep_ms: float = 3000.0,
     lease_ms: Lease = 1000,
@@ -150,16 +151,17 @@ def takeover(
         gateways: Processes on this machine.
         kills: Coordinators that get SIGKILL, one after the other.
         freezes: Coordinators that get SIGSTOP, and SIGCONT once they were succeeded.
+        silents: Coordinators that are killed while another gateway with copies of their tasks is frozen.
         tasks: Under way at the same time.
         sleep_ms: What the first of a task's two subtasks works.
     """
     from appliance.bench.failover.takeover import Options, run
 
     options = Options(
-        gateways=gateways, kills=kills, freezes=freezes, tasks=tasks, sleep_ms=sleep_ms, lease_ms=lease_ms,
-        image=image,
+        gateways=gateways, kills=kills, freezes=freezes, silents=silents, tasks=tasks, sleep_ms=sleep_ms,
+        lease_ms=lease_ms, image=image,
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)
-    wrong = [each for how in ("kill", "freeze") if how in result for each in result[how]["not_exactly_once"]]
+    wrong = [each for how in ("kill", "freeze", "silent") if how in result for each in result[how]["not_exactly_once"]]
     return 1 if wrong else 0

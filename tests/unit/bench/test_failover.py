@@ -7,9 +7,10 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.bench.failover.logs import LogTail, wall_s
-from appliance.bench.failover.takeover import Heard, adoptions, apart
+from appliance.bench.failover.takeover import Heard, adoptions, apart, holder_without_a_part
 from appliance.errors import DeadlineError, UnreachableError
 from appliance.model import TaskRecord, TaskState
+from appliance.plane.ring import Ring
 from appliance.tasks.machine import Transition, TransitionKind
 
 pytestmark = pytest.mark.anyio
@@ -110,3 +111,14 @@ async def test_two_coordinators_must_have_one_record_in_the_end() -> None:
     split, lost = await apart({"late": both, "split": both, "lost": both}, read, tries=3, pause=pause)
     assert split == "split has no one record: gw-1 succeeded #7 of gw-1, gw-2 succeeded #6 of gw-2"
     assert lost == "lost has no one record: no answer"
+
+
+def test_who_is_made_silent_holds_copies_and_takes_nothing_over() -> None:
+    """Otherwise nobody would wait for it, or its own tasks would wait until it is lost too."""
+    ring = Ring((f"gw-{number}" for number in range(1, 9)), virtual_nodes=32)
+    tasks = [name for name in (f"t-{number}" for number in range(100)) if ring.owner(f"task/{name}") == "gw-1"][:3]
+    mute = holder_without_a_part(ring, "gw-1", tasks)
+    left = ring.without_member("gw-1")
+    assert mute not in {left.owner(f"task/{name}") for name in tasks}
+    assert any(mute in left.successors(f"task/{name}", 3) for name in tasks)
+    assert holder_without_a_part(Ring(("gw-1", "gw-2"), virtual_nodes=32), "gw-1", tasks) == ""
