@@ -15,6 +15,8 @@ from appliance.pool.settings import PoolConfig
 
 RULES = LlmConfig(tiers=("rules",))
 """Where plans are not what a test is about: the same words always give the same plan, and no gateway loads a model."""
+INTERRUPTIBLE = ("env", "--default-signal=INT")
+"""Before a command that a test interrupts: where tests run in the background of a shell, what they start ignores it."""
 PLAIN = GatewayConfig(id="base", llm=RULES)
 
 

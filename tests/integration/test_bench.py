@@ -10,6 +10,7 @@ from typing import Any
 
 import psutil
 import pytest
+from fleets import INTERRUPTIBLE
 
 from appliance.bench import actors, federated, migrate, overload, pooled, rate, refill, soak, startup, transfer, zygote
 from appliance.pool.engine import PodmanEngine
@@ -72,7 +73,7 @@ async def test_rates(built: None) -> None:
 async def test_interrupted(built: None, project_root: Path) -> None:
     """Ctrl-C in mid-run ends the command with 130, and takes the fleet, its containers and its folder along."""
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", "bench", "rate", "--mode", "federated", "--rates", "2",
+        *INTERRUPTIBLE, sys.executable, "-m", "appliance.cli", "bench", "rate", "--mode", "federated", "--rates", "2",
         "--seconds", "300", "--json",
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, cwd=project_root,
     )  # fmt: skip

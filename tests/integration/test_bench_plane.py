@@ -7,6 +7,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from fleets import INTERRUPTIBLE
 
 from appliance.bench import idle
 from appliance.bench.failover import restart, takeover
@@ -41,8 +42,8 @@ async def test_members_of_both_views() -> None:
 async def test_members_interrupted(project_root: Path) -> None:
     """Ctrl-C in mid-run ends the command with 130 and takes the router and all hosts along."""
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", "bench", "members", "--members", "8", "--per-process", "4",
-        "--idle-s", "300", "--json",
+        *INTERRUPTIBLE, sys.executable, "-m", "appliance.cli", "bench", "members", "--members", "8",
+        "--per-process", "4", "--idle-s", "300", "--json",
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, cwd=project_root,
     )  # fmt: skip
     assert process.stderr is not None

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from fleets import PLAIN
+from fleets import INTERRUPTIBLE, PLAIN
 
 from appliance import local_fleet
 from appliance.client import FleetClient
@@ -81,7 +81,7 @@ async def test_a_gateway_told_to_stop_in_mid_run_ends_the_run_and_the_task_goes_
 async def test_an_interrupted_submit_cancels_its_task(fleet: FleetState) -> None:
     """Ctrl-C in `submit --wait` ends the task as cancelled, and the command with 130."""
     command = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", "submit", FETCH, "--wait", "--id", "t-interrupted",
+        *INTERRUPTIBLE, sys.executable, "-m", "appliance.cli", "submit", FETCH, "--wait", "--id", "t-interrupted",
         "--fleet", fleet.fleet, "--dir", fleet.directory,
         stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fleets import INTERRUPTIBLE
 from msgspec.structs import replace
 
 from appliance import local_fleet
@@ -298,7 +299,7 @@ async def test_whoever_watches_may_leave_and_the_task_goes_on(up: Up) -> None:
         accepted = await client.submit(plan(Subtask(id="s1", skill="lingers")))
         await follow(client, accepted.id, until=lambda record: _runs(record, "s1"))
         watching = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "appliance.cli", "task", "watch", accepted.id, "--json",
+            *INTERRUPTIBLE, sys.executable, "-m", "appliance.cli", "task", "watch", accepted.id, "--json",
             "--fleet", state.fleet, "--dir", state.directory,
             stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import chromium
 import pytest
-from fleets import fleet_in
+from fleets import INTERRUPTIBLE, fleet_in
 from PIL import Image
 
 from appliance.client import FleetClient
@@ -39,7 +39,7 @@ async def address(small: FleetState, tmp_path: Path) -> AsyncIterator[str]:
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)}
     connect = [word for each in small.endpoints for word in ("--connect", each)]
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", "tui", "--serve", "--fleet", small.fleet, *connect,
+        *INTERRUPTIBLE, sys.executable, "-m", "appliance.cli", "tui", "--serve", "--fleet", small.fleet, *connect,
         stdout=asyncio.subprocess.PIPE, env=environment,
     )  # fmt: skip
     assert process.stdout is not None

@@ -11,6 +11,7 @@ from pathlib import Path
 import aiohttp
 import psutil
 import pytest
+from fleets import INTERRUPTIBLE
 
 from appliance.errors import ConfigError
 from appliance.tui.serve.guard import Guard
@@ -203,7 +204,8 @@ async def test_command_prints_the_address(tmp_path: Path) -> None:
     """`swiftbot tui --serve` prints an address that works, with a token of its own, and ends at Ctrl-C."""
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)}
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", "tui", "--serve", "--fleet", "nobody", "--connect", NOWHERE,
+        *INTERRUPTIBLE, sys.executable, "-m", "appliance.cli", "tui", "--serve", "--fleet", "nobody",
+        "--connect", NOWHERE,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, env=environment,
     )  # fmt: skip
     assert process.stdout is not None
