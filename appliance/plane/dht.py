@@ -53,6 +53,9 @@ _APART_S = 1.0
 """How long a reader asks again when whoever it takes for a key's owner says that the key is another's."""
 _SETTLE_S = 2.0
 """How long an owner lets requests wait for its reconciling; then it answers with what it has."""
+_RETURNED_S = 0.4
+"""How long of it a write waits for one that has come back and is not compared with yet: if it holds something newer, it
+says so when it is given the write. One that is silent must hold up no takeover for long, `reconcile.LOSS_S`."""
 _MOST_NAMED = 5
 """Gateways named in an error."""
 
@@ -236,7 +239,7 @@ class Dht:
         if not self.owns(asked.key):
             owner = self._membership.ring.owner(asked.key)
             raise RefusedError(f"{asked.key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
-        await self._until_settled(asked.key)
+        await self._until_settled(asked.key, returned_s=_RETURNED_S)
         if asked.key in self._unsaved:
             await self._catch_up(asked.key)
         try:
@@ -395,31 +398,39 @@ class Dht:
         async with self._settling:
             self._settling.notify_all()
 
-    def _mine(self, key: str) -> bool:
-        """Whether a key was this gateway's when it last reconciled, and nobody has come back since who may know more.
-
-        From any thread.
-        """
+    def _compared(self, key: str) -> bool:
+        """Whether a key was this gateway's when it last reconciled; from any thread."""
         settled = self._settled
         known = bool(settled.members) and self._stalls == self._pulse.stalls
-        if not known or settled.owner(key) != self._gateway:
-            return False
-        return not self.returned or self.returned.isdisjoint(self._replicas(key))
+        return known and settled.owner(key) == self._gateway
 
-    async def _until_settled(self, key: str) -> bool:
+    def _mine(self, key: str) -> bool:
+        """The same, and nobody has come back since who may know more; from any thread."""
+        return self._compared(key) and (not self.returned or self.returned.isdisjoint(self._replicas(key)))
+
+    async def _until_settled(self, key: str, *, returned_s: float | None = None) -> bool:
         """Wait until this gateway has reconciled as the key's owner, which it may have become just now.
 
+        Args:
+            key: of a record.
+            returned_s: how long of it for members that have come back and are not compared with yet; None: as long.
+
         Returns:
-            Whether it has; False after `_SETTLE_S`: then it goes on with what it has.
+            Whether it has; False after `_SETTLE_S` at most: then it goes on with what it has.
         """
         if self._mine(key):
             return True
         self.on_wanted()
+        loop = asyncio.get_running_loop()
+        until = loop.time() + (_SETTLE_S if returned_s is None else returned_s)
         try:
             async with asyncio.timeout(_SETTLE_S), self._settling:
-                await self._settling.wait_for(partial(self._mine, key))
+                await self._settling.wait_for(partial(self._compared, key))
+                async with asyncio.timeout_at(until):
+                    await self._settling.wait_for(partial(self._mine, key))
         except TimeoutError:
-            log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
+            if returned_s is None or not self._compared(key):
+                log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
             return False
         return True
 

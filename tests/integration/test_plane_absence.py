@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from appliance.errors import DeadlineError, UnreachableError
+from appliance.errors import ConflictError, DeadlineError, UnreachableError
 from appliance.plane import dht, reconcile
 from appliance.plane.messages import Found, KeyAsk, RecordAsk
 from appliance.plane.node import Plane
@@ -190,3 +190,38 @@ async def test_records_of_many_that_are_lost_at_once_are_not_said_to_be_gone(pla
         here._membership._seen(here.keys.alive(name), alive=True)
     await settled(planes)
     assert (await here.dht.read(there) or Record(key="")).value == b"v"
+
+
+async def test_a_silent_member_that_has_come_back_holds_up_no_write(
+    planes: list[Plane], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever takes a task over must write: what is newer there is said when that is given to it.
+
+    A read waits for the comparison, and says that nobody knows where there is no copy.
+    """
+    owner, back = planes[0], planes[1]
+    every = (f"task/{number}" for number in range(200_000))
+    ours = (key for key in every if owner.ring.successors(key, 2) == ("g0", "g1"))
+    same, newer, missing = (next(ours) for _ in range(3))
+    versions = {key: await owner.dht.write(key, b"before", expected=None) for key in (same, newer)}
+    membership, token = owner._membership, owner.keys.alive("g1")
+    membership._seen(token, alive=False)
+    await until(owner.dht.reconciled)
+
+    async def never(*_: Any, **__: Any) -> Any:
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(owner._reconciler._comparing, "compare", never)
+    meanwhile = Record(key=newer, value=b"meanwhile", version={**versions[newer], "g1": 1}, write="w")
+    await back.dht.keep(meanwhile)
+    membership._seen(token, alive=True)
+    assert owner.dht.returned == {"g1"}
+    monkeypatch.setattr(dht, "_SETTLE_S", 3600.0)  # nothing but the shorter wait lets a write through
+    await owner.dht.write(same, b"after", expected=versions[same])
+    with pytest.raises(ConflictError):
+        await owner.dht.write(newer, b"after", expected=versions[newer])
+    assert await owner.store.record(newer) == await back.store.record(newer)
+    monkeypatch.setattr(dht, "_SETTLE_S", 0.05)
+    with pytest.raises(UnreachableError, match="not compared"):
+        await owner.dht.read(missing)
+    assert (await owner.dht.read(same) or meanwhile).value == b"after"

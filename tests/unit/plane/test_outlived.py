@@ -8,6 +8,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from appliance.plane.comparing import ASK_S, SEE_S
+from appliance.plane.dht import _RETURNED_S
 from appliance.plane.keys import Keys
 from appliance.plane.membership import Membership
 from appliance.plane.node import Plane
@@ -213,3 +214,4 @@ def test_whoever_is_not_seen_hears_so_before_its_question_ends() -> None:
 def test_a_silent_member_leaves_a_takeover_its_second() -> None:
     """Who takes over waits for it twice: when it compares its copies, and when it writes that it has taken over."""
     assert LOSS_S + PlaneConfig().replica_timeout_s < 1.0
+    assert _RETURNED_S + PlaneConfig().replica_timeout_s < 1.0
