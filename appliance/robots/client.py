@@ -10,6 +10,8 @@ instead, `appliance.robots.zenoh_client`; the three files can be copied. The con
     for news in client.follow(task):
         print(news["state"], news.get("done"), news.get("total"))
 
+A whole plan may come with it, so that no model is asked: `client.submit("to the gate", plan={"domain": ..., "subtasks":
+[...]})`.
 `AsyncTaskClient` is the same for asyncio.
 """
 
@@ -40,6 +42,8 @@ POLL_S = 0.05
 BEAT_S = 1.0
 _ONBOARD = (18, 8, 0, 0, 4)
 """MAV_TYPE_ONBOARD_CONTROLLER, no autopilot, active."""
+LOOK_S = 15.0
+"""How often a task is asked after while nothing is heard of it: its gateway may have been restarted."""
 MAX_NEWS = 1000
 """Messages kept that nobody asked for yet."""
 
@@ -85,20 +89,25 @@ class TaskClient:
         self._channel = Channel(lambda: secrets.randbits(32))
         self._news: deque[News] = deque(maxlen=MAX_NEWS)
 
-    def submit(self, instruction: str, *, task: str = "", timeout_s: float = 60.0) -> str:
+    def submit(self, instruction: str, *, task: str = "", timeout_s: float = 60.0, **request: Any) -> str:
         """Ask for a task; returns its id once it is durable.
 
         Args:
             instruction: what to do, in words.
             task: its id; asked again with the same one, it is the same task. Made up when empty.
             timeout_s: how long the fleet is waited for.
+            request: further fields of a TaskRequest (docs/schemas), as plain data: `plan`, so that no model is asked,
+                `priority`, `deadline_s`, `group`, `approval`. All together have at most 16 KiB.
 
         Raises:
             TaskRejected: it will not be done, and why.
             TimeoutError: nothing was heard; asking again with the same id is safe.
         """
         task = task or f"r-{secrets.token_hex(6)}"
-        self._ask({"op": "submit", "id": task, "instruction": instruction}, timeout_s)
+        letter: dict[str, Any] = {"op": "submit", "id": task, "instruction": instruction}
+        if request:
+            letter = {"op": "submit", "id": task, "request": {"instruction": instruction, **request}}
+        self._ask(letter, timeout_s)
         return task
 
     def cancel(self, task: str, *, timeout_s: float = 60.0) -> str:
@@ -114,13 +123,34 @@ class TaskClient:
             again: ask to be told, as after a restart. Errors then as `submit`.
         """
         until = time.monotonic() + timeout_s
+        told: News = {}
         if again:
             self._ask({"op": "follow", "id": task}, timeout_s)
         while True:
-            found = self._wait(lambda news: news.get("op") == "news" and news.get("id") == task, until)
+            found = self._news_of(task, until)
+            if found == told:
+                continue  # asked after, and nothing has changed
+            told = found
             yield found
             if found.get("state") in FINAL:
                 return
+
+    def _news_of(self, task: str, until: float) -> News:
+        """Wait for a task's news, and ask for them where none come; TimeoutError, TaskRejected."""
+        while True:
+            look_at = time.monotonic() + LOOK_S
+            try:
+                return self._wait(lambda news: news.get("op") == "news" and news.get("id") == task, min(until, look_at))
+            except TimeoutError:
+                if time.monotonic() >= until:
+                    raise
+            try:
+                self._ask({"op": "follow", "id": task}, min(2 * LOOK_S, until - time.monotonic()))
+            except TimeoutError:
+                continue  # there is nobody just now
+            except TaskRejected as error:
+                if not error.retry:
+                    raise
 
     def pump(self, timeout_s: float = POLL_S) -> None:
         """Send what is due and take in what comes; the other methods do so while they wait."""
@@ -148,22 +178,25 @@ class TaskClient:
         if whole is not None:
             try:
                 news = json.loads(whole)
-            except ValueError:
+            except (ValueError, RecursionError):
                 return
             if isinstance(news, dict):
                 self._news.append(cast("News", news))
 
-    def _ask(self, letter: dict[str, str], timeout_s: float) -> News:
+    def _ask(self, letter: dict[str, Any], timeout_s: float) -> News:
         until = time.monotonic() + timeout_s
-        try:
-            number = self._channel.send(json.dumps(letter).encode(), time.monotonic())
-        except NotDelivered as error:
-            raise TaskRejected(str(error), code="payload") from error
-        answers = ("accepted", "rejected")
 
         def answered(news: News) -> bool:
-            return news.get("op") in answers and news.get("id") in (letter["id"], "")
+            if news.get("op") not in ("accepted", "rejected") or news.get("id") not in (letter["id"], ""):
+                return False
+            return news.get("to", letter["op"]) == letter["op"]
 
+        for late in [news for news in self._news if answered(news)]:
+            self._news.remove(late)  # of an earlier question, which was not waited for any longer
+        try:
+            number = self._channel.send(json.dumps(letter).encode(), time.monotonic())
+        except (NotDelivered, TypeError, ValueError, RecursionError) as error:
+            raise TaskRejected(str(error), code="payload") from error
         answer = self._wait(answered, until, number)
         if answer["op"] == "rejected":
             raise TaskRejected(
@@ -197,9 +230,9 @@ class AsyncTaskClient:
         self._client = TaskClient(connection, **options)
         self._lock = threading.Lock()
 
-    async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 60.0) -> str:
+    async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 60.0, **request: Any) -> str:
         """As `TaskClient.submit`."""
-        return await self._run(lambda: self._client.submit(instruction, task=task, timeout_s=timeout_s))
+        return await self._run(lambda: self._client.submit(instruction, task=task, timeout_s=timeout_s, **request))
 
     async def cancel(self, task: str, *, timeout_s: float = 60.0) -> str:
         """As `TaskClient.cancel`."""

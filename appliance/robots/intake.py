@@ -102,8 +102,16 @@ def read_request(message: Message) -> tuple[str, TaskRequest]:
     else:
         seed = b"\0".join((robot.encode(), message.payload, str(message.at_ns // _SECOND_NS).encode()))
         identity = f"r-{hashlib.sha256(seed).hexdigest()[:12]}"
+    return robot, own(request, identity=identity, submitter=robot)
+
+
+def own(request: TaskRequest, *, identity: str, submitter: str) -> TaskRequest:
+    """Return what a robot asks as its own, whomever it names.
+
+    Where its plan came from is not for it to say: that is told by whoever makes plans here, and would bring it into the
+    cache of those.
+    """
     plan = request.plan
     if plan is not None and plan.provenance is not None:
-        # Where a plan came from is told by whoever made it here; of others it would get into the plan cache.
         plan = msgspec.structs.replace(plan, provenance=None)
-    return robot, msgspec.structs.replace(request, id=identity, submitter=robot, plan=plan)
+    return msgspec.structs.replace(request, id=identity, submitter=submitter, plan=plan)

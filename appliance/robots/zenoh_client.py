@@ -48,20 +48,23 @@ class ZenohTaskClient:
         self._root = f"swiftbot/{fleet}"
         self._robot = robot
 
-    def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0) -> str:
+    def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0, **request: Any) -> str:
         """Ask for a task; returns its id once it is durable on its replicas.
 
         Args:
             instruction: what to do, in words.
             task: its id; asked again with the same one, it is the same task. Made up when empty.
             timeout_s: how long the fleet is waited for.
+            request: further fields of a TaskRequest (docs/schemas), as plain data: `plan`, so that no model is asked,
+                `priority`, `deadline_s`, `group`, `approval`.
 
         Raises:
             ZenohTaskRejected: it will not be done, and why.
             TimeoutError: no gateway answered; asking again with the same id is safe.
         """
         task = task or f"r-{secrets.token_hex(6)}"
-        record = self._ask(f"robot/{self._robot}/task", {"instruction": instruction, "id": task}, timeout_s)
+        wanted = {**request, "instruction": instruction, "id": task}
+        record = self._ask(f"robot/{self._robot}/task", wanted, timeout_s)
         return str(record["id"])
 
     def register(
@@ -120,7 +123,7 @@ class ZenohTaskClient:
                 return _table(reply.ok.payload.to_bytes())
         return {}
 
-    def _ask(self, key: str, request: dict[str, str], timeout_s: float) -> Record:
+    def _ask(self, key: str, request: Record, timeout_s: float) -> Record:
         payload = json.dumps(request).encode()
         for reply in self._session.get(f"{self._root}/{key}", payload=payload, timeout=timeout_s):
             if reply.ok is not None:
@@ -162,9 +165,9 @@ class AsyncZenohTaskClient:
     def __init__(self, session: Any, *, fleet: str, robot: str) -> None:
         self._client = ZenohTaskClient(session, fleet=fleet, robot=robot)
 
-    async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0) -> str:
+    async def submit(self, instruction: str, *, task: str = "", timeout_s: float = 10.0, **request: Any) -> str:
         """As `ZenohTaskClient.submit`."""
-        return await asyncio.to_thread(self._client.submit, instruction, task=task, timeout_s=timeout_s)
+        return await asyncio.to_thread(self._client.submit, instruction, task=task, timeout_s=timeout_s, **request)
 
     async def register(self, **what: Any) -> Registration:
         """As `ZenohTaskClient.register`."""

@@ -14,6 +14,8 @@ async def test_nothing_is_lost_or_doubled_while_gateways_are_killed(built: None,
     options = Options(gateways=4, tasks=20, seconds=40.0, every_s=3.0, seed=7, keep=str(tmp_path / "chaos"))
     result = await run(options, progress=print)
     assert result["broken"] == [], result
+    assert result["decisions"]["diverged"] == 0, result
+    assert set(result["decisions"]["checked"]) >= {"machine", "record", "placement"}, "and there were some"
     assert result["tasks"]["accepted"] == result["tasks"]["states"]["succeeded"] == 20
     assert result["effects"]["lines"] == result["effects"]["wanted"]
     assert result["downtime"]["outages"]["kill"] >= 3

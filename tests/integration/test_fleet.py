@@ -35,6 +35,13 @@ from appliance.tasks.replay import replay
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 
 LOOK = "Rover_1: go to dock 3, photograph the red box, detect red boxes and report to the operator"
+UP_AND_DOWN = {
+    "domain": "navigation",
+    "subtasks": [
+        {"id": "up", "skill": "takeoff", "robot": "drone_1", "params": {"altitude_m": 4.0}},
+        {"id": "down", "skill": "land", "robot": "drone_1", "after": ["up"]},
+    ],
+}
 FETCH = "Rover_1: go to dock 3, pick the red box, then go to dock 2 and place the red box at dock 2"
 
 
@@ -79,7 +86,8 @@ async def test_a_task_by_zenoh(fleet: FleetState, monkeypatch: pytest.MonkeyPatc
 async def test_a_task_by_mavlink(tmp_path: Path) -> None:
     """A ground station's button makes a task of the vehicle it addresses: acknowledged when durable, told to its end.
 
-    The repeated command is the same task, and the vehicle flies once. Words through TUNNEL frames make one as well.
+    The repeated command is the same task, and the vehicle flies once. Words through TUNNEL frames make one as well, and
+    so does a plan.
     """
     template = Template(id=7, instruction="{robot}: take off, then land")
     order = Order(
@@ -111,20 +119,31 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
             texts.append(list(client.follow("in-words", timeout_s=60))[-1]["state"])
             with pytest.raises(TaskRejected, match="is empty"):
                 client.submit(" ")
+            client.submit("up and down", task="by-plan", plan=UP_AND_DOWN, priority=6)
+            texts.append(list(client.follow("by-plan", timeout_s=60))[-1]["state"])
+            with pytest.raises(TaskRejected, match="not understood"):
+                client.submit("up and down", task="no-plan", plan={"subtasks": "all"})
+            client.submit("away", task="bad-plan", plan=UP_AND_DOWN | {"subtasks": [{"id": "s1", "skill": "vanish"}]})
+            last = list(client.follow("bad-plan", timeout_s=60))[-1]
+            texts += [last["state"], last["message"]]
         finally:
             ground.close()
         return answers, texts
 
     try:
         answers, texts = await asyncio.to_thread(station)
-        assert texts.pop() == "succeeded"
+        assert "plan handed in is not valid" in texts.pop()
+        assert [texts.pop(), texts.pop(), texts.pop()] == ["failed", "succeeded", "succeeded"]
         task = texts[-1].split()[0]
         assert [result for result, _ in answers] == [5, 0, 0]
         assert answers[1] == answers[2] == (0, task_number(task))
         async with FleetClient(state.endpoint) as client:
             record = await client.task(task)
+            planned = await client.task("by-plan")
         assert (record.instruction, record.submitter) == ("drone_1: take off, then land", "mavlink-255-190")
         assert record.state is TaskState.SUCCEEDED
+        assert (planned.handed_in, planned.priority, planned.submitter) == (True, 6, "mavlink-255-190")
+        assert [each.subtask.id for each in planned.subtasks] == ["up", "down"]
     finally:
         await local_fleet.down(order.directory, progress=print)
     assert set(commands_in(state, task).values()) == {1}

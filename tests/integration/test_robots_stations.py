@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import importlib.util
 import json
+import math
 import shutil
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -34,6 +35,7 @@ from appliance.model import (
     TaskState,
     encode,
 )
+from appliance.model.geo import to_globe
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
@@ -292,8 +294,18 @@ async def mavproxy(field: Field, master: str, *outs: str) -> MavProxy:
     return MavProxy(await field.start(sys.executable, str(program), *arguments, env=environment, **pipes))
 
 
+def _waypoints(path: Path, *points: tuple[float, float]) -> None:
+    """Write a mission as ground stations keep it in files: home, then points of the site at 7 m."""
+    lines = ["QGC WPL 110"]
+    for number, point in enumerate(((0.0, 0.0), *points)):
+        latitude, longitude, _ = to_globe(SITE, *point)
+        place = f"{latitude:.7f}\t{longitude:.7f}\t{7 if number else 0}"
+        lines.append(f"{number}\t{int(not number)}\t{3 if number else 0}\t16\t0\t0\t0\t0\t{place}\t1")
+    path.write_text("\n".join(lines) + "\n")
+
+
 async def test_mavproxy_flies_and_asks_for_a_task(field: Field) -> None:
-    """MAVProxy reads the parameters, arms, takes off, sends a task, hears of it, and brings the vehicle home."""
+    """MAVProxy reads the parameters, arms, takes off, flies a mission, sends a task, hears of it, and comes home."""
     await field.vehicle()
     station = await mavproxy(field, f"tcp:127.0.0.1:{field.stations}")
     try:
@@ -303,6 +315,12 @@ async def test_mavproxy_flies_and_asks_for_a_task(field: Field) -> None:
         await station.type("takeoff 6", "NAV_TAKEOFF: ACCEPTED")
         await until(lambda: field.infos[-1].pose is not None and field.infos[-1].pose.z > 5.0)
         await station.type("param show WPNAV_SPEED", "500.0")
+        way = field.folder / "way.txt"
+        _waypoints(way, (8.0, 12.0), (14.0, 12.0))
+        await station.type(f"wp load {way}", "Sent all 3")
+        await station.type("mode auto", "Mode AUTO")
+        await until(lambda: field.infos[-1].mode == "AUTO" and field.infos[-1].mission_item == 2)
+        await until(lambda: (pose := field.infos[-1].pose) and math.dist((pose.x, pose.y), (14.0, 12.0)) < 1.5)
         await station.type("mode rtl", "DO_SET_MODE: ACCEPTED")
         await until(lambda: field.infos[-1].mode == "RTL" and not field.infos[-1].armed)
         # It says nothing to a setting that is changed, and the value when it is asked for.

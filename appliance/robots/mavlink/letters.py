@@ -3,13 +3,15 @@
 From a robot or ground station:
 
     {"op": "submit", "id": "r1-42", "instruction": "..."}   the sender chooses the id: sent again, it is the same task
-    {"op": "follow", "id": "r1-42"}                         tell how a task goes on, after a restart of the sender
+    {"op": "submit", "id": "r1-42", "request": {...}}       the same as a TaskRequest (docs/schemas), with a plan, say;
+                                                            its id and submitter are the sender's
+    {"op": "follow", "id": "r1-42"}                         tell how a task goes on, after a restart of either end
     {"op": "cancel", "id": "r1-42"}
 
-and back:
+and back (`to`: the op that is answered):
 
-    {"op": "accepted", "id", "state"}                       durable on its replicas
-    {"op": "rejected", "id", "code", "message", "remedy", "retry"}
+    {"op": "accepted", "to", "id", "state"}                 durable on its replicas
+    {"op": "rejected", "to", "id", "code", "message", "remedy", "retry"}
     {"op": "news", "id", "state", "done", "total", "message"}   on each change, until a final state; then also
                                                             "results", by subtask, as far as 8 KiB hold them
 """
@@ -27,6 +29,7 @@ from msgspec import Struct, field
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest, encode
 from appliance.robots.doors import Tasks
+from appliance.robots.intake import own
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.requests import STATION
@@ -39,7 +42,7 @@ MAX_SENDERS = 64
 MAX_AT_WORK = 16
 """Messages being carried out at once."""
 MAX_FOLLOWED = 1000
-"""Tasks whose senders are told how they go on; the oldest is forgotten first."""
+"""Tasks whose senders are told how they go on; the one asked for longest ago is forgotten first."""
 MOST_RESULTS = 8 * 1024
 """Bytes of results that are told; what is larger is looked up by the task's id."""
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
@@ -51,6 +54,7 @@ class Letter(Struct, frozen=True, kw_only=True):
     op: Literal["submit", "follow", "cancel"]
     id: str
     instruction: str = ""
+    request: TaskRequest | None = None
 
 
 class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -58,6 +62,7 @@ class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     op: Literal["accepted", "rejected", "news"]
     id: str
+    to: str = ""
     state: str = ""
     done: int = 0
     total: int = 0
@@ -71,7 +76,8 @@ class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
 class _Sender:
     """One other end."""
 
-    def __init__(self, reply: Callable[[Message], None]) -> None:
+    def __init__(self, key: tuple[int, int], reply: Callable[[Message], None]) -> None:
+        self.key = key
         self.name = ""
         """Whose its tasks are: the vehicle that speaks, not one that it addresses."""
         self.reply = reply
@@ -92,8 +98,8 @@ class LetterDesk:
         self._refused = refused
         self._clock = clock
         self._senders: OrderedDict[tuple[int, int], _Sender] = OrderedDict()
-        self._followed: OrderedDict[str, tuple[_Sender, bytes]] = OrderedDict()
-        """Task -> who is told, and what was told last."""
+        self._followed: OrderedDict[str, dict[tuple[int, int], bytes]] = OrderedDict()
+        """Task -> who is told, and what they were told last."""
         self._at_work: set[asyncio.Task[None]] = set()
 
     async def close(self) -> None:
@@ -108,7 +114,7 @@ class LetterDesk:
         key = (frame.system, frame.component)
         sender = self._senders.get(key)
         if sender is None:
-            sender = self._senders[key] = _Sender(reply)
+            sender = self._senders[key] = _Sender(key, reply)
             while len(self._senders) > MAX_SENDERS:
                 self._senders.popitem(last=False)
         self._senders.move_to_end(key)
@@ -148,16 +154,19 @@ class LetterDesk:
         return task in self._followed
 
     def news(self, record: TaskRecord) -> None:
-        """Tell a task's sender how it goes on."""
+        """Tell a task's senders how it goes on."""
         found = self._followed.get(record.id)
         if found is None:
             return
-        sender, told = found
         said = encode(_news(record))
-        if said != told:
-            self._followed[record.id] = (sender, said)
-            self._send(sender, said)
-        if record.state.final:
+        for key, told in list(found.items()):
+            sender = self._senders.get(key)
+            if sender is None:
+                del found[key]  # forgotten: when it speaks again it asks
+            elif said != told:
+                found[key] = said
+                self._send(sender, said)
+        if record.state.final or not found:
             del self._followed[record.id]
 
     # --- inside ------------------------------------------------------------------------------------------------
@@ -177,37 +186,55 @@ class LetterDesk:
         work.add_done_callback(self._at_work.discard)
 
     async def _carry_out(self, sender: _Sender, letter: Letter) -> None:
+        new = self._follow(letter.id, sender)
         try:
             if self._tasks is None:
                 raise RefusedError("this gateway takes no tasks")
-            self._follow(letter.id, sender)
             if letter.op == "submit":
-                request = TaskRequest(instruction=letter.instruction, id=letter.id, submitter=sender.name)
-                record = await self._tasks.submit(request)
-                log.info("task by MAVLink", task=record.id, sender=sender.name, instruction=letter.instruction[:200])
+                request = letter.request or TaskRequest(instruction=letter.instruction)
+                record = await self._tasks.submit(own(request, identity=letter.id, submitter=sender.name))
+                log.info("task by MAVLink", task=record.id, sender=sender.name, instruction=request.instruction[:200])
             elif letter.op == "cancel":
                 record = await self._tasks.cancel(letter.id, sender.name)
             else:
                 record = await self._tasks.look(letter.id)
         except SwiftbotError as error:
-            self._followed.pop(letter.id, None)
+            if new:
+                self._unfollow(letter.id, sender)
             self._reject(sender, letter, error)
             return
-        self._say(sender, Answer(op="accepted", id=letter.id, state=record.state))
+        self._say(sender, Answer(op="accepted", to=letter.op, id=letter.id, state=record.state))
         if record.sequence > 1:
             self.news(record)
 
-    def _follow(self, task: str, sender: _Sender) -> None:
-        self._followed[task] = (sender, b"")
+    def _follow(self, task: str, sender: _Sender) -> bool:
+        """Tell a sender how a task goes on, from how it stands now; whether it was not told before."""
+        found = self._followed.setdefault(task, {})
+        new = sender.key not in found
+        found[sender.key] = b""
+        self._followed.move_to_end(task)
         while len(self._followed) > MAX_FOLLOWED:
             self._followed.popitem(last=False)
+        return new
+
+    def _unfollow(self, task: str, sender: _Sender) -> None:
+        found = self._followed.get(task, {})
+        found.pop(sender.key, None)
+        if not found:
+            self._followed.pop(task, None)
 
     def _reject(self, sender: _Sender, letter: Letter, error: SwiftbotError) -> None:
         passing = isinstance(error, _PASSING)
         self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
         log.warning("what was asked by MAVLink is refused", sender=sender.name, op=letter.op, reason=str(error))
         answer = Answer(
-            op="rejected", id=letter.id, code=error.code, message=error.message, remedy=error.remedy, retry=passing
+            op="rejected",
+            to=letter.op,
+            id=letter.id,
+            code=error.code,
+            message=error.message,
+            remedy=error.remedy,
+            retry=passing,
         )
         self._say(sender, answer)
 

@@ -13,7 +13,7 @@ system or of a vehicle's: param1 is the template, param2 to param7 its arguments
 COMMAND_CANCEL stops the task that the sender asked for last by the command that it names, MAV_CMD_USER_2 whichever it
 asked for last (for ground stations whose buttons can send commands only). COMMAND_ACK answers by command alone, so a
 sender has one outstanding; a repetition (`confirmation` above 0) of the last one gets the last
-answer, also from a gateway that was restarted in between. How the task goes on is told by STATUSTEXT.
+answer, also from a gateway that was restarted in between. How the task goes on is told by STATUSTEXT (`progress`).
 """
 
 import asyncio
@@ -34,6 +34,7 @@ from appliance.robots.doors import Tasks
 from appliance.robots.ledger import KeyValues
 from appliance.robots.mavlink import dialect, texts
 from appliance.robots.mavlink.dialect import Frame, Message
+from appliance.robots.mavlink.progress import Progress, Reach
 from appliance.robots.settings import Template
 
 log = structlog.get_logger(__name__)
@@ -51,9 +52,7 @@ MAX_SENDERS = 64
 """Whose last request is remembered; the longest silent is forgotten first."""
 MAX_AT_WORK = 16
 """Requests being carried out at once, of different senders."""
-MAX_FOLLOWED = 1000
-"""Tasks whose senders are told how they go on; the oldest is forgotten first."""
-_INFO, _NOTICE, _ERROR = texts.INFO, texts.NOTICE, texts.ERROR
+_NOTICE, _ERROR = texts.NOTICE, texts.ERROR
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
 """Errors after which it may be asked again."""
 
@@ -66,6 +65,10 @@ class Asked(Struct, kw_only=True):
     result: int | None = None
     why: str = ""
     command: int = ASK
+    system: int = 0
+    """The system id that it addressed, as which it is spoken to."""
+    ended: bool = False
+    """Whether it was told how the task ended."""
 
 
 class _Work(Struct, frozen=True, kw_only=True):
@@ -122,6 +125,7 @@ class RequestDesk:
         refused: counters of bad input.
         mission: returns the instruction and plan of a vehicle's mission, by the parameters of MISSION_START; None:
             none are taken here.
+        reach: finds senders of before a restart, who are told how their tasks go on.
     """
 
     def __init__(
@@ -132,6 +136,7 @@ class RequestDesk:
         store: KeyValues,
         refused: dict[str, int],
         mission: Callable[[str, tuple[float, ...]], tuple[str, Plan]] | None = None,
+        reach: Reach = lambda _sender, _system: None,
     ) -> None:
         self._templates = {each.id: each for each in templates}
         self._tasks = tasks
@@ -141,24 +146,28 @@ class RequestDesk:
         self._cancelling: dict[str, asyncio.Task[None]] = {}
         self._last: OrderedDict[str, Asked] = OrderedDict()
         self._at_work: dict[str, _Work] = {}
-        self._followed: OrderedDict[str, tuple[Callable[[Message], None], str]] = OrderedDict()
-        """Task -> how its sender is told, and what was told last."""
+        self._keeping: set[asyncio.Task[None]] = set()
+        self._progress = Progress(tasks=tasks, reach=reach, ended=self._ended)
 
     async def load(self) -> None:
         """Read what was asked for before a restart."""
         for key, value in await self._store.scan(PREFIX):
             try:
-                self._last[key.removeprefix(PREFIX)] = msgspec.json.decode(value, type=Asked)
+                sender = key.removeprefix(PREFIX)
+                asked = self._last[sender] = msgspec.json.decode(value, type=Asked)
+                if asked.result == dialect.ACCEPTED and not asked.ended:
+                    self._progress.resume(asked.task, sender, asked.system)
             except msgspec.DecodeError as error:
                 log.warning("a kept request cannot be read and is dropped", key=key, reason=str(error))
                 await self._store.delete(key)
 
     async def close(self) -> None:
         """Stop; what is being handed in is asked again by its sender."""
+        await self._progress.close()
         running = [*(each.running for each in self._at_work.values()), *self._cancelling.values()]
         for task in running:
             task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
+        await asyncio.gather(*running, *self._keeping, return_exceptions=True)
 
     def take(self, frame: Frame, *, robot: str, asker: str = "", reply: Callable[[Message], None]) -> None:
         """Take a command that is for this gateway.
@@ -215,6 +224,7 @@ class RequestDesk:
             parameters=parameters_of(frame.message),
             task=f"m-{secrets.token_hex(6)}",
             command=frame.message.command,
+            system=frame.target_system,
         )
         self._last[sender] = asked
         self._last.move_to_end(sender)
@@ -231,7 +241,7 @@ class RequestDesk:
             request = self._request(asked, robot=robot, submitter=asker or f"{STATION}{sender}")
             # Kept before it is handed in: whoever repeats it after a crash here asks for the same task.
             await self._store.put(PREFIX + sender, encode(asked))
-            self._follow(asked.task, reply)
+            self._progress.follow(asked.task, sender, reply)
             if self._tasks is None:
                 raise PayloadError("this gateway takes no tasks")
             await self._tasks.submit(request)
@@ -241,7 +251,7 @@ class RequestDesk:
             passing = isinstance(error, _PASSING)
             asked.result = dialect.TEMPORARILY_REJECTED if passing else dialect.DENIED
             asked.why = error.message
-            self._followed.pop(asked.task, None)
+            self._progress.forget(asked.task)
             self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
             log.warning("task by MAVLink is refused", sender=sender, reason=str(error))
         try:
@@ -327,31 +337,30 @@ class RequestDesk:
 
     def follows(self, task: str) -> bool:
         """Whether somebody is told how this task goes on."""
-        return task in self._followed
-
-    def _follow(self, task: str, reply: Callable[[Message], None]) -> None:
-        self._followed[task] = (reply, "")
-        while len(self._followed) > MAX_FOLLOWED:
-            self._followed.popitem(last=False)
+        return self._progress.follows(task)
 
     def news(self, record: TaskRecord) -> None:
-        """Tell a task's sender how it goes on: its state, how many subtasks are done, and in the end why."""
-        found = self._followed.get(record.id)
-        if found is None:
-            return
-        reply, told = found
-        done = sum(each.state.final for each in record.subtasks)
-        text = f"{record.id} {record.state}"
-        if record.state is TaskState.RUNNING:
-            text += f" {done}/{len(record.subtasks)}"
-        if record.failure is not None:
-            text += f": {record.failure.message}"
-        if text != told:
-            severity = _ERROR if record.state is TaskState.FAILED else _NOTICE if record.state.final else _INFO
-            self._say(reply, text, severity)
-            self._followed[record.id] = (reply, text)
-        if record.state.final:
-            del self._followed[record.id]
+        """Tell a task's sender how it goes on."""
+        self._progress.news(record)
+
+    def tick(self, now: float) -> None:
+        """Tell senders of before a restart, once they are heard; to be called some twenty times a second."""
+        self._progress.tick(now)
+
+    def _ended(self, sender: str, task: str) -> None:
+        """Keep that a sender knows its last task's end."""
+        last = self._last.get(sender)
+        if last is not None and last.task == task:
+            last.ended = True
+            keeping = asyncio.create_task(self._keep(sender, last), name=f"end of {task}")
+            self._keeping.add(keeping)
+            keeping.add_done_callback(self._keeping.discard)
+
+    async def _keep(self, sender: str, asked: Asked) -> None:
+        try:
+            await self._store.put(PREFIX + sender, encode(asked))
+        except SwiftbotError as error:
+            log.warning("the answer to a request could not be kept", sender=sender, reason=str(error))
 
     def _reply(self, frame: Frame, reply: Callable[[Message], None], asked: Asked) -> None:
         if asked.why:

@@ -146,6 +146,11 @@ class Router:
         """Where each (system, component) is."""
         return {sender: end for sender, (end, _) in self._routes.items()}
 
+    def where(self, system: int, component: int) -> End | None:
+        """Return where that very component was heard last."""
+        found = self._routes.get((system, component))
+        return None if found is None else found[0]
+
     def knows(self, system: int, component: int) -> bool:
         """Whether that very component has been heard."""
         return (system, component) in self._routes

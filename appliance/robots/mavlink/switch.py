@@ -87,7 +87,12 @@ class Switch:
         )
         self._missions = MissionDesk(config, site=site, store=store, refused=refused, clock=time.monotonic)
         self._requests = RequestDesk(
-            config.templates, tasks=tasks, store=store, refused=refused, mission=self._missions.request
+            config.templates,
+            tasks=tasks,
+            store=store,
+            refused=refused,
+            mission=self._missions.request,
+            reach=self._reach,
         )
         self._letters = LetterDesk(tasks=tasks, refused=refused, clock=time.monotonic)
         self._records: Closer | None = None
@@ -178,6 +183,23 @@ class Switch:
             self._requests.take(frame, robot=robot, asker=asker, reply=reply)
         return True
 
+    def _reach(self, sender: str, system: int) -> Callable[[Message], None] | None:
+        """Return how a sender is told something as the onboard computer of a system; None where it is not heard."""
+        whose, _, component = sender.partition("-")
+        known = whose.isdecimal() and component.isdecimal()
+        end = self.router.where(int(whose), int(component)) if known else None
+        if end is None:
+            return None
+
+        def reply(message: Message) -> None:
+            entry = self.links.get(end.link)
+            if entry is not None:
+                raw = entry.link.send(message, end.address, system=system or self._config.system_id)
+                for name in self._names_at(end) or ("",):
+                    self.record(end, name, "tx", raw)
+
+        return reply
+
     def _tell_time(self, entry: OpenLink, frame: Frame, source: End, sender: Vehicle | None) -> None:
         """Answer a question for the time with this gateway's own, the one that its questions carry.
 
@@ -240,6 +262,7 @@ class Switch:
             self._session.put(self._session.keys.links(self._gateway), encode(self.link_list()))
         self._letters.tick()
         self._missions.tick()
+        self._requests.tick(now)
 
     def _follows(self, key: str) -> bool:
         """Whether anybody here is told of a record: most are of other gateways' business, and large."""

@@ -10,8 +10,13 @@ what has arrived of one:
     ACK       `index` parts from the first on have arrived; the data is a bitmap of those after them (bit 0 first)
     REFUSED   the message will not be taken; the data says why
 
-A message is delivered once, whole and unchanged, or its sender learns that it was not. Plain code for both ends, the
-clock passed in; the standard library alone, since robots' companion computers run it too (`appliance.robots.client`).
+A message is delivered once, whole and unchanged, or its sender learns that it was not. Each ACK is the whole account
+of what the other end has, and the sender goes by the last one: after an outage what has arrived is not sent again, and
+an end that has forgotten its parts (it was restarted, or had to make room) is sent them again. It is delivered when an
+ACK says that it is whole. Only an end that forgets a whole message may take it twice: what is asked for has an id.
+
+Plain code for both ends, the clock passed in; the standard library alone, since robots' companion computers run it too
+(`appliance.robots.client`).
 """
 
 import itertools
@@ -35,11 +40,11 @@ WINDOW = 16
 RESEND_S = 0.6
 LAST_RESEND_S = 4.0
 GIVE_UP_S = 60.0
-"""Without any news of a message for so long, it is not delivered."""
+"""Without any news of a message for so long, it is not delivered: an outage may last so long."""
 ACK_WAIT_S = 0.05
 """Parts that come together are acknowledged together."""
 MAX_COMING = 4
-"""Messages of one other end that may be incomplete at once."""
+"""Messages of one other end that may be incomplete at once; so many are under way at once, the others wait."""
 MAX_GOING = 32
 """Messages that may wait to be delivered to one other end."""
 REMEMBERED = 256
@@ -61,6 +66,7 @@ class _Going:
         """Index of each part not known to have arrived -> when it is to be sent (again)."""
         self.pause_s = RESEND_S
         self.heard_at = now
+        self.begun = False
 
     def due(self, now: float) -> list[bytes]:
         """Return the payloads to send now, within the window."""
@@ -73,16 +79,23 @@ class _Going:
             self.pause_s = min(1.3 * self.pause_s, LAST_RESEND_S)
         return found
 
-    def acknowledged(self, first: int, bitmap: bytes, now: float) -> None:
-        """Take in what has arrived."""
+    def acknowledged(self, first: int, bitmap: bytes, now: float) -> bool:
+        """Take in what the other end has; whether that is all."""
+        if first >= len(self.parts):
+            return True
         before = len(self.missing)
-        for index in list(self.missing):
+        for index in range(min(len(self.parts), first + 8 * len(bitmap))):
             place = index - first
-            if place < 0 or (place // 8 < len(bitmap) and bitmap[place // 8] >> place % 8 & 1):
-                del self.missing[index]
+            if place < 0 or bitmap[place // 8] >> place % 8 & 1:
+                self.missing.pop(index, None)
+            else:
+                # It may have had it and forgotten. Where this account was merely overtaken by a later one nothing is
+                # sent in vain: that takes it out again, or the next one does before the part is due.
+                self.missing.setdefault(index, now + self.pause_s)
         self.heard_at = now
         if len(self.missing) < before:
             self.pause_s = RESEND_S
+        return False
 
 
 class _Coming:
@@ -111,6 +124,7 @@ class Channel:
         self._done: OrderedDict[int, tuple[int, int]] = OrderedDict()
         """Messages taken: id -> (count, CRC)."""
         self._acks: dict[int, float] = {}
+        self._heard_at = float("-inf")
         self._refusals: list[bytes] = []
         self.failed: dict[int, str] = {}
         """Messages that were not delivered, and why; whoever sent them takes them out."""
@@ -138,12 +152,18 @@ class Channel:
         found, self._refusals = self._refusals, []
         for number in [number for number, at in self._acks.items() if at <= now]:
             del self._acks[number]
-            found.append(self._account(number))
+            found += self._account(number)
+        under_way = 0
         for number, message in list(self._going.items()):
-            if now - message.heard_at > GIVE_UP_S:
+            # Those that wait for others are not given up while the other end takes these.
+            heard_at = message.heard_at if message.begun else max(message.heard_at, self._heard_at)
+            if now - heard_at > GIVE_UP_S:
                 del self._going[number]
                 self._fail(number, f"nothing was heard for {GIVE_UP_S:g} s")
-            else:
+            elif under_way < MAX_COMING:
+                under_way += 1
+                if not message.begun:
+                    message.begun, message.heard_at = True, now
                 found += message.due(now)
         for number, coming in list(self._coming.items()):
             if now - coming.heard_at > GIVE_UP_S:
@@ -168,9 +188,9 @@ class Channel:
         message = self._going.get(number)
         if message is None or message.crc != crc:
             return None  # late news of what is done
+        self._heard_at = now
         if kind == ACK:
-            message.acknowledged(index, data, now)
-            if not message.missing:
+            if message.acknowledged(index, data, now):
                 del self._going[number]
         elif kind == REFUSED:
             del self._going[number]
@@ -193,7 +213,7 @@ class Channel:
         coming = self._coming.get(number)
         if coming is None:
             if len(self._coming) >= MAX_COMING:
-                self._coming.popitem(last=False)  # the oldest: its sender sends on, and begins again
+                self._coming.popitem(last=False)  # the oldest: by the next account its sender begins again
             coming = self._coming[number] = _Coming(count, crc)
         if (coming.count, coming.crc) != (count, crc):
             self.malformed += 1
@@ -215,14 +235,14 @@ class Channel:
             self._done.popitem(last=False)
         return whole
 
-    def _account(self, number: int) -> bytes:
-        """Return the ACK of a message."""
+    def _account(self, number: int) -> list[bytes]:
+        """Return the ACK of a message; none of one of which nothing is left."""
         if number in self._done:
             count, crc = self._done[number]
-            return _pack(ACK, number, count, count, crc, b"")
+            return [_pack(ACK, number, count, count, crc, b"")]
         coming = self._coming.get(number)
         if coming is None:
-            return _pack(ACK, number, 0, 0, 0, b"")
+            return []
         first = 0
         while first in coming.parts:
             first += 1
@@ -231,7 +251,7 @@ class Channel:
             place = index - first
             if 0 <= place < 8 * len(bits):
                 bits[place // 8] |= 1 << place % 8
-        return _pack(ACK, number, first, coming.count, coming.crc, bytes(bits))
+        return [_pack(ACK, number, first, coming.count, coming.crc, bytes(bits))]
 
     def _refuse(self, number: int, crc: int, why: str) -> None:
         if len(self._refusals) < MAX_GOING:

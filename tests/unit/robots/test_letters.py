@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from appliance.errors import NotFoundError, RefusedError, SwiftbotError
-from appliance.model import TaskRecord, TaskRequest, TaskState
+from appliance.model import Plan, Provenance, Subtask, TaskRecord, TaskRequest, TaskState, Tier
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
 from appliance.robots.mavlink.letters import Answer, LetterDesk
@@ -26,6 +26,7 @@ class Air:
         self.loss = loss
         self.chance = random.Random(5)  # noqa: S311 - a bad radio, no secret
         self.submitted: Counter[str] = Counter()
+        self.requests: list[TaskRequest] = []
         self.error: SwiftbotError | None = None
         self.refused: dict[str, int] = {}
         doors = Tasks(submit=self.submit, cancel=lambda task, _: self.look(task), look=self.look) if tasks else None
@@ -41,6 +42,7 @@ class Air:
         if self.error is not None:
             raise self.error
         self.submitted[request.id] += 1
+        self.requests.append(request)
         return TaskRecord(id=request.id, instruction=request.instruction, sequence=1)
 
     async def look(self, task: str) -> TaskRecord:
@@ -137,6 +139,95 @@ async def test_news_until_the_end() -> None:
     assert [each.state for each in air.answers if each.op == "news"] == ["running", "succeeded"]
 
 
+async def test_a_whole_request_comes_with_its_plan() -> None:
+    """A structured task is the sender's own, whomever it names, and where its plan came from is not for it to say."""
+    air = Air()
+    plan = Plan(
+        domain="transport",
+        subtasks=tuple(Subtask(id=f"s{number}", skill="goto", params={"place": "gate" * 20}) for number in range(30)),
+        provenance=Provenance(tier=Tier.RULES),
+    )
+    request = TaskRequest(instruction="to the gate", id="other", submitter="an operator", plan=plan, priority=7)
+    data = msgspec.json.encode({"op": "submit", "id": "t1", "request": request})
+    assert len(data) > 2000
+    answer = await air.ask(data)
+    assert (answer.op, answer.to, answer.id) == ("accepted", "submit", "t1")
+    bare = msgspec.structs.replace(plan, provenance=None)
+    assert air.requests == [msgspec.structs.replace(request, id="t1", submitter="drone_1", plan=bare)]
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        b"[]",
+        b'"go"',
+        b"{}",
+        b'{"instruction":"go","priority":99}',
+        b'{"instruction":"go","plan":{"subtasks":7}}',
+        b'{"instruction":"go","unknown":1}',
+        b'{"instruction":"go","plan":{"subtasks":[{"id":"s","skill":"x","params":'
+        + b'{"a":' * 2000
+        + b"1"
+        + b"}" * 2004,
+    ],
+)
+async def test_whole_requests_that_are_none(request_: bytes) -> None:
+    """What is no TaskRequest is answered so and counted, however deep; nothing is handed in."""
+    air = Air()
+    answer = await air.ask(b'{"op":"submit","id":"t1","request":' + request_ + b"}")
+    assert (answer.op, answer.code) == ("rejected", "payload")
+    assert air.refused == {"tunnel_malformed": 1}
+    assert air.requests == []
+    assert (await air.ask(letter("submit", "t1", "go"))).op == "accepted"
+
+
+async def test_each_follower_is_told() -> None:
+    """Two that follow one task are both told; one who is refused about it takes nobody's news away."""
+    air = Air()
+    heard: dict[int, list[bytes]] = {2: [], 3: []}
+    said: dict[int, list[bytes]] = {2: [], 3: []}
+    channels = {system: Channel(itertools.count(system << 8).__next__) for system in heard}
+
+    async def other(system: int, data: bytes) -> None:
+        air.codec = Codec(system, 192)
+        channels[system].send(data, air.now)
+        for _ in range(12):
+            await turn()
+
+    async def turn() -> None:
+        air.now += 0.05
+        for system, channel in channels.items():
+            air.codec = Codec(system, 192)
+            for payload in channel.due(air.now):
+                air.desk.take(
+                    air.frame(payload),
+                    reply=lambda message, to=system: said[to].append(bytes(message.payload[: message.payload_length])),
+                )
+        await asyncio.sleep(0)
+        air.desk.tick()
+        for system, payloads in said.items():
+            while payloads:
+                whole = channels[system].take(payloads.pop(0), air.now)
+                if whole is not None:
+                    heard[system].append(whole)
+        for _ in range(3):
+            await asyncio.sleep(0)
+
+    await other(2, letter("submit", "t1", "go"))
+    await other(3, letter("follow", "t1"))
+    air.error = RefusedError("too many tasks")
+    await other(3, letter("submit", "t1", "go"))
+    await other(3, letter("cancel", "t9"))
+    air.desk.news(TaskRecord(id="t1", instruction="", state=TaskState.SUCCEEDED, sequence=9))
+    for _ in range(12):
+        await turn()
+    for system, told in heard.items():
+        answers = [msgspec.json.decode(each, type=Answer) for each in told]
+        assert [each.state for each in answers if each.op == "news"][-1] == "succeeded", system
+    assert not air.desk.follows("t1")
+    assert not air.desk.follows("t9")
+
+
 async def test_refusals_have_their_reason() -> None:
     """What is refused comes back with code, message and whether it may be asked again."""
     air = Air()
@@ -166,7 +257,11 @@ async def test_payloads_that_are_none() -> None:
     for payload in (b"", b"SB", b"XX\x01\x01" + bytes(12), b"SB\x01\x09" + bytes(12)):
         air.desk.take(air.frame(payload), reply=air.reply)
     assert air.refused["tunnel_malformed"] >= 3
+    assert (await air.ask(letter("submit", "t1", "go"))).op == "accepted"
     for system in range(1, 200):
         air.codec = Codec(system, 1)
         air.desk.take(air.frame(b""), reply=air.reply)
     assert len(air.desk._senders) == 64
+    # Who was forgotten for them is told nothing more, and that is not kept either.
+    air.desk.news(TaskRecord(id="t1", instruction="", state=TaskState.RUNNING, sequence=3))
+    assert not air.desk.follows("t1")

@@ -1,12 +1,13 @@
 """Tasks asked for by MAVLink command: asked once, answered alike, refused with a reason."""
 
 import asyncio
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import pytest
 
-from appliance.errors import ConfigError, RefusedError, SwiftbotError
+from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import Failure, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
@@ -32,6 +33,9 @@ class Fleet:
         self.submitted: list[TaskRequest] = []
         self.cancelled: list[str] = []
         self.by: list[str] = []
+        self.heard: set[tuple[str, int]] = set()
+        self.looked: list[str] = []
+        self.records: dict[str, TaskRecord] = {}
         self.error: SwiftbotError | None = None
         self.gate = asyncio.Event()
         self.gate.set()
@@ -41,8 +45,19 @@ class Fleet:
 
     def new_desk(self) -> RequestDesk:
         """Return a desk on the same store, as after a restart."""
-        tasks = Tasks(submit=self.submit, cancel=self.cancel_by, look=self.cancel)
-        return RequestDesk(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused)
+        tasks = Tasks(submit=self.submit, cancel=self.cancel_by, look=self.look)
+        return RequestDesk(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused, reach=self.reach)
+
+    def reach(self, sender: str, system: int) -> Callable[[Message], None] | None:
+        """Find a sender of before a restart, once it is heard."""
+        return self.said.append if (sender, system) in self.heard else None
+
+    async def look(self, task: str) -> TaskRecord:
+        """Tell how a task stands, or raise."""
+        self.looked.append(task)
+        if self.error is not None:
+            raise self.error
+        return self.records[task]
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
         """Take a task, or raise."""
@@ -280,6 +295,76 @@ async def test_how_it_goes_on_is_told(fleet: Fleet) -> None:
     assert len({each.id for each in rest}) == 1
     assert rest[0].id != 0
     assert rest[0].severity == 3
+
+
+async def _later(fleet: Fleet, now: float) -> None:
+    fleet.desk.tick(now)
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+async def test_how_it_goes_on_is_told_after_a_restart(fleet: Fleet) -> None:
+    """Once its sender is heard again it is told how its task stands, then each change; its end once, over restarts."""
+    fleet.send(param1=1.0)
+    await fleet.answered(2)
+    task = fleet.submitted[0].id
+    parts = tuple(SubtaskRecord(subtask=Subtask(id=f"s{number}", skill="goto")) for number in (1, 2))
+    fleet.records[task] = TaskRecord(id=task, instruction="", state=TaskState.RUNNING, subtasks=parts)
+    fleet.desk = fleet.new_desk()
+    await fleet.desk.load()
+    await _later(fleet, 1.0)
+    assert fleet.looked == []
+    fleet.heard.add(("255-190", 1))
+    fleet.error = RefusedError("gw-1 is starting")
+    await _later(fleet, 1.5)
+    assert fleet.looked == [], "not more than once a second"
+    await _later(fleet, 3.0)
+    assert (fleet.looked, fleet.texts) == ([task], [])
+    fleet.error = None
+    await _later(fleet, 5.0)
+    assert fleet.texts == [f"{task} running 0/2"]
+    assert fleet.desk.follows(task)
+    await _later(fleet, 7.0)
+    assert len(fleet.looked) == 2
+    fleet.desk.news(msgspec.structs.replace(fleet.records[task], state=TaskState.SUCCEEDED))
+    assert fleet.texts[1:] == [f"{task} succeeded"]
+    await fleet.desk.close()
+    fleet.desk = fleet.new_desk()
+    await fleet.desk.load()
+    await _later(fleet, 9.0)
+    assert len(fleet.looked) == 2, "its end has been told"
+    fleet.send(param1=1.0, confirmation=4)
+    await fleet.answered(3)
+    assert fleet.acks[-1] == (ACCEPTED, task_number(task))
+
+
+async def test_what_ended_while_the_gateway_was_away_is_told(fleet: Fleet) -> None:
+    """The result reaches its sender all the same; a task that nobody knows any more is asked for once."""
+    for system, state in ((254, TaskState.SUCCEEDED), (255, None)):
+        fleet.send(param1=1.0, source=(system, 190))
+        await fleet.answered(2 * (system - 253))
+        task = fleet.submitted[-1].id
+        if state is not None:
+            fleet.records[task] = TaskRecord(id=task, instruction="", state=state)
+        fleet.heard.add((f"{system}-190", 1))
+    done, gone = (each.id for each in fleet.submitted)
+    kept = fleet.store.values["mavlink/request/254-190"]
+    fleet.store.values["mavlink/request/no sender"] = kept.replace(done.encode(), b"m-1")
+
+    async def look(task: str) -> TaskRecord:
+        fleet.looked.append(task)
+        if task == gone:
+            raise NotFoundError(f"no task {task}")
+        return fleet.records[task]
+
+    fleet.look = look  # type: ignore[method-assign]
+    fleet.desk = fleet.new_desk()
+    await fleet.desk.load()
+    for now in (2.0, 4.0, 6.0):
+        await _later(fleet, now)
+    assert fleet.texts == [f"{done} succeeded"]
+    assert fleet.looked.count(gone) == 1
+    assert not fleet.desk.follows(gone)
 
 
 @pytest.mark.parametrize(
