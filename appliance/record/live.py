@@ -8,6 +8,7 @@ as they are there. A slow client loses its oldest messages (the SDK's bounded ba
 import asyncio
 import contextlib
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +33,8 @@ PORT = 8765
 NAME = "live"
 """In the place of a recorder's name, in the keys of derived messages."""
 MOST_CHANNELS = 10_000
-"""Beyond, the channel that was silent for longest is closed: each task has some of its own."""
+"""Beyond, the channel that was silent for longest is closed: each task has some of its own. Keys that nobody wants
+count as well."""
 BACKLOG = 1024
 """Messages that wait for one client; the oldest are dropped."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -92,7 +94,8 @@ class LiveView:
         keys = session.keys
         self._raw = tuple(map(compile_expression, (keys.mavlink(), keys.link_frames(), keys.camera())))
         self._wanted = [compile_expression(each) for each in options.keys]
-        self._channels: dict[tuple[str, str], _Channel | None] = {}
+        self._channels: OrderedDict[tuple[str, str], _Channel | None] = OrderedDict()
+        """By key and encoding, the one that was silent for longest first; None: not wanted."""
         self._subscription: Closer | None = None
         self.messages = 0
         try:
@@ -138,8 +141,10 @@ class LiveView:
         if message.deleted:
             return
         which = (message.key, message.encoding)
-        channel = self._channels.get(which, self)
-        if isinstance(channel, LiveView):
+        if which in self._channels:
+            channel = self._channels[which]
+            self._channels.move_to_end(which)
+        else:
             channel = self._open(which)
         if channel is None:
             return
@@ -152,22 +157,27 @@ class LiveView:
             channel.base.log(clean, log_time=at_ns)
             self.messages += 1
             for made in channel.derive(message) if channel.derive else ():
-                known = self._channels.get((made.topic, JSON))
-                other = known or self._made((made.topic, JSON), made.kind, None)
+                topic = (made.topic, JSON)
+                other = self._channels.get(topic) or self._made(topic, made.kind, None)
+                self._channels.move_to_end(topic)
                 other.base.log(made.payload, log_time=at_ns)
 
     def _open(self, which: tuple[str, str]) -> _Channel | None:
         key, encoding = which
         if self._wanted and not any(each.fullmatch(key) for each in self._wanted):
+            self._make_room()
             self._channels[which] = None
             return None
         return self._made(which, self._schemas.kind_of(key, encoding), self._views.deriving(key))
 
+    def _make_room(self) -> None:
+        while len(self._channels) >= MOST_CHANNELS:
+            _, silent = self._channels.popitem(last=False)
+            if silent is not None:
+                silent.base.close()
+
     def _made(self, which: tuple[str, str], kind: ChannelKind, derive: Derive | None) -> _Channel:
-        if len(self._channels) >= MOST_CHANNELS:
-            oldest = self._channels.pop(next(iter(self._channels)))
-            if oldest is not None:
-                oldest.base.close()
+        self._make_room()
         encoding = "jsonschema" if kind.schema else ""
         schema = self._foxglove.Schema(name=kind.schema, encoding=encoding, data=kind.schema_text)
         base = self._foxglove.Channel(

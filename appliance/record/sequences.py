@@ -21,6 +21,9 @@ _ATTEMPT = re.compile(rb'"attempt"\s*:\s*(\d{1,9})')
 _COORDINATOR = re.compile(rb'"coordinator"\s*:\s*"([^"]{0,80})"')
 _V1, _V2 = 0xFE, 0xFD
 _WINDOW = 256
+_RESTARTED = 3
+"""So many frames in a row that follow each other, and not the last one, are of a component that began again."""
+_UNHEARD = (-1, -1, 0)
 
 
 class Hole(Struct, frozen=True):
@@ -35,7 +38,8 @@ class Sequences:
     """Notices holes in the numbers of one fleet's speakers."""
 
     def __init__(self, keys: Keys) -> None:
-        self._last: OrderedDict[tuple[str, str], int] = OrderedDict()
+        self._last: OrderedDict[tuple[str, str], tuple[int, int, int]] = OrderedDict()
+        """The last number of each, the last one that came behind it, and how many of those came in a row."""
         self._kinds = (
             (compile_expression(keys.transition()), "transition"),
             (compile_expression(keys.run()), "run"),
@@ -76,17 +80,27 @@ class Sequences:
             number, speaker = payload[2], f"{payload[3]}/{payload[4]}"
         else:
             return None
-        last = self._note((key, speaker), number)
-        missing = 0 if last is None else (number - last - 1) % _WINDOW
-        # More than half of the circle is one that was overtaken, not 200 that were lost.
-        return self._hole("mavlink", missing, key) if 0 < missing < _WINDOW // 2 else None
+        source = (key, speaker)
+        last, late, run = self._last.get(source, _UNHEARD)
+        ahead = (number - last) % _WINDOW
+        if last < 0 or 0 < ahead <= _WINDOW // 2:
+            self._note(source, number)
+            return self._hole("mavlink", ahead - 1, key) if last >= 0 and ahead > 1 else None
+        # Behind: one that was overtaken, or is told again; or its speaker has begun again, as some in a row show.
+        run = run + 1 if number == (late + 1) % _WINDOW else 1
+        if run < _RESTARTED:
+            self._note(source, last, late=number, run=run)
+        else:
+            self._note(source, number)
+        return None
 
-    def _note(self, source: tuple[str, str], number: int) -> int | None:
-        last = self._last.pop(source, None)
-        self._last[source] = number
+    def _note(self, source: tuple[str, str], number: int, *, late: int = -1, run: int = 0) -> int | None:
+        """Remember what was heard last of a source; returns what was before."""
+        last, _, _ = self._last.pop(source, _UNHEARD)
+        self._last[source] = (number, late, run)
         if len(self._last) > MOST_SOURCES:
             self._last.popitem(last=False)
-        return last
+        return None if last < 0 else last
 
     def _hole(self, kind: str, missing: int, key: str) -> Hole:
         self.missing[kind] = self.missing.get(kind, 0) + missing

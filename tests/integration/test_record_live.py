@@ -17,7 +17,9 @@ from appliance.local_fleet import free_port
 from appliance.model import GatewayStatus, LogLine, Pose, RobotInfo, Site, encode
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
+from appliance.record import live
 from appliance.record.about import About
+from appliance.record.facts import LoggedMessage
 from appliance.record.live import NAME, LiveOptions, LiveView
 from appliance.record.reader import info
 from appliance.record.recorder import Recorder
@@ -125,6 +127,29 @@ async def test_the_fleet_is_seen_as_in_a_log(sessions: tuple[Session, Session], 
             schema = offered["schema"]
             text = base64.b64decode(schema) if offered.get("schemaEncoding") == "protobuf" else schema
             assert json.loads(text)["type"] == "object"
+
+
+async def test_keys_without_end_cost_no_memory(
+    sessions: tuple[Session, Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Channels are bounded, wanted or not: those that were silent for longest go, one that goes on speaking stays."""
+    monkeypatch.setattr(live, "MOST_CHANNELS", 20)
+    speaker, viewer = sessions
+    keys = speaker.keys
+    for wanted in ((), (keys.log("g1"),)):
+        view = LiveView(viewer, LiveOptions(port=0, keys=wanted))
+        try:
+            messages = [
+                LoggedMessage(key, 5, b"{}", "application/json")
+                for number in range(200)
+                for key in (keys.log("g1"), keys.task(f"t{number}"))
+            ]
+            view._take(messages)
+            assert len(view._channels) <= 20
+            assert (keys.log("g1"), "application/json") in view._channels
+            assert view.channels == (1 if wanted else len(view._channels))
+        finally:
+            view.stop()
 
 
 def test_it_listens_on_loopback_only() -> None:

@@ -123,6 +123,21 @@ async def test_a_part_on_other_keys_in_a_loop(stage: tuple[Session, Ear], log: P
     assert any(each.key == session.keys.intake("r1") for each in ear.messages)
 
 
+async def test_what_is_left_out_and_without_a_clock(stage: tuple[Session, Ear], log: Path) -> None:
+    """Keys that are excluded are not played whatever is included, nor the log's time where nobody wants it."""
+    session, ear = stage
+    select = Select(keys=("swiftbot/**",), without=("**/status", "**/mavlink/**"))
+    played = await Player(session, [log], PlayOptions(select=select, rate=0.0, clock=False, presence=False)).play()
+    assert (played.messages, played.left_out, played.ended) == (1, 1, True)
+    await _until(lambda: ear.messages)
+    session.put(session.keys.log("end"), b"{}")
+    await _until(lambda: ear.messages[-1].key == session.keys.log("end"))
+    keys = session.keys
+    assert [each.key for each in ear.messages] == [keys.container("g1", "c1"), keys.log("end")]
+    assert ear.clocks == []
+    assert keys.alive("g1") not in ear.alive
+
+
 async def test_by_hand(stage: tuple[Session, Ear], log: Path) -> None:
     """Begun standing: a step plays one message; a jump leaves out what lies between; back plays it again; q ends."""
     session, ear = stage

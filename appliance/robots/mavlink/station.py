@@ -95,6 +95,7 @@ class Station:
             on_gone=self._link_gone,
             vehicles_of=self._vehicles_of,
             names_at=self._names_at,
+            name_of=self._name_of,
         )
         self._others: set[str] = set()
         self._watch: Closer | None = None
@@ -190,6 +191,10 @@ class Station:
             found = tuple(each.vehicle.name for each in self._by_source.values() if each.end == end)
             self._names[end] = found
         return found
+
+    def _name_of(self, frame: Frame, source: End) -> str:
+        each = self._by_source.get((source.link, frame.system))
+        return each.vehicle.name if each is not None and each.end == source else ""
 
     def _is_guest(self, entry: OpenLink, frame: Frame) -> bool:
         """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer."""

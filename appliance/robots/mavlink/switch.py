@@ -50,6 +50,7 @@ class Switch:
         on_gone: told each link that was removed.
         vehicles_of: the vehicles of a system id.
         names_at: names of the vehicles at an end.
+        name_of: the vehicle whose frame it is, when it comes from that end; "" for none.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class Switch:
         on_gone: Callable[[OpenLink], None],
         vehicles_of: Callable[[int], Sequence[Vehicle]],
         names_at: Callable[[End], Sequence[str]],
+        name_of: Callable[[Frame, End], str],
     ) -> None:
         self._config = config
         self._session = session
@@ -74,6 +76,7 @@ class Switch:
         self._on_frame = on_frame
         self._vehicles_of = vehicles_of
         self._names_at = names_at
+        self._name_of = name_of
         self._loop = asyncio.get_running_loop()
         self.router = Router(own_system=config.system_id, repeat_s=config.repeat_s)
         self.links = LinkTable(
@@ -122,12 +125,14 @@ class Switch:
         now = self._loop.time()
         source = (frame.system, frame.component)
         sender = entry.link.stats.sender(*source)
+        end = entry.end(address)
         if self.router.repeated(frame.raw, now, sender=source):
             sender.repeated += 1
             self._refused["repeated"] = self._refused.get("repeated", 0) + 1
+            self.record(end, self._name_of(frame, end), "rx", frame.raw)  # it goes no further, but it was heard
             return
         sender.hear(frame.sequence, now)
-        self._on_frame(entry, frame, entry.end(address), now)
+        self._on_frame(entry, frame, end, now)
 
     def hand_on(self, entry: OpenLink, frame: Frame, source: End, sender: Vehicle | None, now: float) -> None:
         """Take what is for the gateway, pass on the rest. `sender`: the vehicle whose system's frame it is."""

@@ -1,5 +1,6 @@
 """Holes in the numbers that speakers give to their messages."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,39 @@ def test_frames_count_in_a_byte(header: bytes) -> None:
     assert hole.missing == 3
     assert sequences.heard("mavlink", key, frame(4)) is None
     assert sequences.heard("mavlink", key, b"\xfd") is None
+
+
+def _heard(numbers: Iterable[int]) -> int:
+    """Return how many frames are missing where these numbers come."""
+    sequences = Sequences(KEYS)
+    for number in numbers:
+        sequences.heard("mavlink", KEYS.mavlink("r1", "rx"), bytes((0xFE, 9, number % 256, 1, 1)) + bytes(12))
+    return sequences.missing.get("mavlink", 0)
+
+
+def test_frames_out_of_order_are_counted_once() -> None:
+    """What was missing when a later frame came counts; that it comes after all, or again, makes no further hole."""
+    assert _heard((5, 7, 6, 8)) == 1
+    assert _heard((5, 5, 6, 6, 5, 7)) == 0
+    assert _heard((10, 7, 8, 11)) == 0
+    assert _heard((250, 2, 255, 0, 3)) == 7
+
+
+@given(st.integers(0, 255), st.lists(st.integers(0, 20), max_size=30))
+def test_repetitions_are_no_holes(first: int, again: list[int]) -> None:
+    """However many of the last frames are told again, and when: nothing is missing of those that all came."""
+    numbers: list[int] = []
+    for number in range(60):
+        numbers.append(first + number)
+        if number < len(again):
+            numbers.append(first + number - min(number, again[number]))
+    assert _heard(numbers) == 0
+
+
+def test_a_component_that_begins_again_is_followed() -> None:
+    """After a restart its numbers count from three frames on, and what is missing from then on is seen."""
+    assert _heard((200, 201, 202, 3, 4, 5, 6, 7)) == 56, "it may have lost so many: the same byte, an hour later"
+    assert _heard((100, 101, 3, 4, 5, 6, 9)) == 2
 
 
 def test_speakers_are_forgotten_beyond_a_bound() -> None:

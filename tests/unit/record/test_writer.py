@@ -112,6 +112,33 @@ def test_finished_file_is_valid_mcap(tmp_path: Path) -> None:
     assert (KEYS.mavlink("r1", "rx"), 6) in found
 
 
+def test_a_file_says_whose_it_is_and_what_its_frames_are(tmp_path: Path) -> None:
+    """Foxglove finds its device, named or by fleet and recorder; frames tell their dialect and direction."""
+    written = {
+        tmp_path / "a": ({}, {"deviceName": "f1-recorder"}),
+        tmp_path / "b": (
+            {"device_name": "yard-7", "device_id": "dev_0aB1"},
+            {"deviceName": "yard-7", "deviceId": "dev_0aB1"},
+        ),
+    }
+    for folder, (changes, device) in written.items():
+        writer = _writer(folder, **changes)
+        for key in (KEYS.mavlink("r1", "rx"), KEYS.link_frames("g1", "0", "tx")):
+            writer.write(LoggedMessage(key, 6, b"\xfd\x09", "application/mavlink"))
+        writer.close()
+        with writer.files[0].open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            assert {each.name: each.metadata for each in reader.iter_metadata()}["foxglove"] == device
+            summary = reader.get_summary()
+            assert summary is not None
+            assert {each.compression for each in summary.chunk_indexes} == {"zstd"}
+            told = {each.topic: each.metadata for each in summary.channels.values()}
+        assert told[KEYS.mavlink("r1", "rx")].items() >= {"dialect": "ardupilotmega", "direction": "rx"}.items()
+        assert (
+            told[KEYS.link_frames("g1", "0", "tx")].items() >= {"dialect": "ardupilotmega", "direction": "tx"}.items()
+        )
+
+
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     """Keys, times, payloads, encodings and deletions come back; copies made for Foxglove do not."""
     writer = _writer(tmp_path)

@@ -2,10 +2,13 @@
 
 import asyncio
 import contextlib
+import gc
 import os
 import pty
+import random
 import socket
 import struct
+import tracemalloc
 import tty
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -362,6 +365,64 @@ async def test_two_vehicles_with_one_system_id_on_two_links(kind: str) -> None:
         assert {(each.mode, each.armed) for each in _told(made)} <= {("GUIDED", False)}
 
 
+def _storm(chance: random.Random, count: int) -> list[tuple[bytes, tuple[str, int]]]:
+    """Return frames of every kind that makes a gateway remember something, from ever other senders and addresses."""
+    found: list[tuple[bytes, tuple[str, int]]] = []
+    target = {"target_system": 242, "target_component": 191}
+    params = {f"param{number}": 0.0 for number in range(1, 8)}
+    for number in range(count):
+        codec = Codec(chance.randint(1, 60), chance.choice((1, 100, 190, 191, 192)))
+        codec._mav.seq = chance.randint(0, 255)
+        message = chance.choice(
+            (
+                lambda: make("HEARTBEAT", **STATION),
+                lambda: make("HEARTBEAT", **BEAT),
+                lambda: make("TIMESYNC", tc1=chance.choice((0, 5)), ts1=chance.getrandbits(60)),
+                lambda: make("COMMAND_LONG", command=31010, confirmation=chance.randint(0, 2), **target, **params),
+                lambda: make("COMMAND_CANCEL", command=31010, **target),
+                lambda: make("MISSION_COUNT", count=chance.randint(0, 300), mission_type=0, **target),
+                lambda: make("STATUSTEXT", severity=6, text=b"x" * 50, id=chance.randint(1, 9999), chunk_seq=3),
+                lambda: make("MISSION_CURRENT", seq=chance.randint(0, 9999)),
+            )
+        )()
+        raw = codec.pack(message)
+        if chance.random() < 0.2:
+            part = struct.pack("<2sBBIHHI", b"SB", 1, PART, chance.getrandbits(32), 0, 2, 0) + bytes(112)
+            raw = _tunnel(codec, part)
+        elif chance.random() < 0.1:
+            raw = raw[: chance.randint(1, len(raw))]
+        found.append(
+            (raw, (f"10.{number % 7}.{chance.randint(0, 9)}.{chance.randint(1, 250)}", chance.randint(1, 9999)))
+        )
+    return found
+
+
+async def test_a_flood_of_everything_costs_no_memory() -> None:
+    """Frames that make a gateway remember something, from ever other senders: what is kept does not grow with them."""
+    async with station(_port(), sender_hz=0.0, repeat_s=0.01, max_vehicles=8) as (made, refused):
+        session = cast("Wire", made._session)
+        (entry,) = tuple(made.links)
+        # The addresses are made up, so nothing may be sent to them.
+        cast("Any", entry.link)._write = lambda *_: True
+        chance = random.Random(7)  # noqa: S311 - no secret
+        kept: list[int] = []
+        tracemalloc.start()
+        try:
+            for _ in range(5):
+                for raw, address in _storm(chance, 1000):
+                    entry.link.feed(raw, address)
+                for _ in range(50):
+                    made._switch.tick(asyncio.get_running_loop().time())
+                    await asyncio.sleep(0)
+                session.puts.clear()
+                gc.collect()
+                kept.append(tracemalloc.get_traced_memory()[0])
+        finally:
+            tracemalloc.stop()
+        assert min(refused.get(what, 0) for what in ("truncated", "address_conflict", "mission_refused")) > 0, refused
+        assert kept[-1] - kept[1] < 2**20, kept
+
+
 def _part(*, index: int, count: int, data: bytes) -> bytes:
     return struct.pack("<2sBBIHHI", b"SB", 1, PART, 4711, index, count, 0) + data
 
@@ -433,6 +494,38 @@ async def test_two_vehicles_with_one_system_id() -> None:
 
         await until(lambda: refused.get("address_conflict", 0) > 5, both)
         assert made.attached == ("drone_1",)
+
+
+async def test_a_repetition_is_recorded_and_goes_no_further() -> None:
+    """What comes twice stands in the log twice, under who said it, and another end gets it once."""
+    port, other = _port(), _port()
+    async with (
+        station(port, MavlinkLink(listen=f"udp://127.0.0.1:{other}"), repeat_s=600.0) as (made, refused),
+        sender(port) as vehicle,
+        sender(other) as ground,
+    ):
+        codec, watching = Codec(1, 1), Codec(255, 190)
+        await until(lambda: made.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.link_list().routes.get("255/190"), lambda: ground(_watch(watching)))
+        said, asked = codec.pack(make("HEARTBEAT", **(BEAT | {"custom_mode": 5}))), _watch(watching)
+        session = cast("Wire", made._session)
+        keys = session.keys
+
+        def told(raw: bytes) -> int:
+            return sum(payload == raw and key.endswith("/rx") for key, payload in session.puts)
+
+        await until(lambda: told(said) > 2 and told(asked) > 2, lambda: (vehicle(said), ground(asked)))
+        assert refused["repeated"] == told(said) + told(asked) - 2
+        heard = [key for key, payload in session.puts if payload == said and key.endswith("/rx")]
+        assert set(heard) == {keys.mavlink("drone_1", "rx")}
+        assert sum(key.endswith("/tx") for key, payload in session.puts if payload == said) == 1
+        heard = [key for key, payload in session.puts if payload == asked and key.endswith("/rx")]
+        assert set(heard) == {keys.link_frames("gw-1", "1", "rx")}
+        assert sum(key.endswith("/tx") for key, payload in session.puts if payload == asked) == 1
+
+
+def _watch(codec: Codec) -> bytes:
+    return codec.pack(make("HEARTBEAT", **STATION))
 
 
 async def test_a_recorded_signed_link_played_again(tmp_path: Any) -> None:
