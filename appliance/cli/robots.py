@@ -73,6 +73,7 @@ def robots_link_add(
     only_out: tuple[str, ...] = (),
     not_out: tuple[str, ...] = (),
     prefix: str = "drone_",
+    mavlink1: Annotated[bool, Parameter(negative="")] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -86,11 +87,12 @@ def robots_link_add(
         only_out: Message of other links that may be sent there.
         not_out: But not this one.
         prefix: Names of vehicles heard there: this and their system id.
+        mavlink1: Send MAVLink 1 alone, to what understands no other.
     """
     serial = url.startswith("serial:")
     link = MavlinkLink(
         listen="" if connect or serial else url, connect=url if connect or serial else "", signing=signing,
-        only_in=only_in, not_in=not_in, only_out=only_out, not_out=not_out, prefix=prefix,
+        only_in=only_in, not_in=not_in, only_out=only_out, not_out=not_out, prefix=prefix, mavlink1=mavlink1,
     )  # fmt: skip
     link.check()
 

@@ -53,6 +53,9 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """File with the link's MAVLink 2 signing key, readable by this user alone: a passphrase, or `hex:` and 64 digits;
     `credential:NAME` for one that systemd hands over. Set, every frame sent is signed and frames that are unsigned,
     wrongly signed or replayed are refused. Empty: no signing, and signed frames are refused."""
+    mavlink1: bool = False
+    """Send MAVLink 1 alone, to an old radio or autopilot that understands no other; both are always understood. What
+    MAVLink 1 has no message for (TUNNEL, gimbal managers, ...) is then not sent, and counted. Not with `signing`."""
     only_in: tuple[str, ...] = ()
     """Messages by name (`ATTITUDE`, ...) or number heard here that may go on to other links; none: all."""
     not_in: tuple[str, ...] = ()
@@ -85,6 +88,10 @@ class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def check(self) -> None:
         """Raise ConfigError for an address, system id or name that cannot be."""
         _ = self.remote
+        if self.mavlink1 and self.signing:
+            raise ConfigError(
+                f"robots.mavlink {self.remote}: MAVLink 1 has no signatures", remedy="leave out mavlink1 or signing"
+            )
         for system, name in self.names.items():
             if not system.isdecimal() or not 1 <= int(system) <= MAX_SYSTEM:
                 raise ConfigError(

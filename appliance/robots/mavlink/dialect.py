@@ -14,6 +14,7 @@ from appliance.robots.mavlink.frames import (
     MARKER_V2,
     Damage,
     Frame,
+    as_v1,
     as_v2,
     check,
     frame_length,
@@ -29,33 +30,50 @@ __all__ = ["Codec", "Damage", "Frame", "Message", "Stream", "constant", "frame_l
 class Codec:
     """Decoder and encoder of one link. `system` and `component` are what it sends as.
 
-    With a `signer` every frame sent is signed and every frame read must be; without one signed frames are refused.
+    With a `signer` every frame sent is signed and every frame read must be; without one signed frames are refused. Both
+    versions of MAVLink are read; with `v1` the first is sent alone.
     """
 
     def __init__(
-        self, system: int, component: int, *, signer: Signer | None = None, clock: Callable[[], int] = wall_ticks
+        self,
+        system: int,
+        component: int,
+        *,
+        signer: Signer | None = None,
+        clock: Callable[[], int] = wall_ticks,
+        v1: bool = False,
     ) -> None:
         self._mav: Any = _dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self.system = system
         self.component = component
         self.signer = signer
         self._clock = clock
+        self._v1 = v1
 
     def pack(self, message: Message, *, system: int | None = None) -> bytes:
-        """Encode a message as a MAVLink 2 frame with the next sequence number.
+        """Encode a message as a frame with the next sequence number; empty where MAVLink 1 has no such message.
 
         `system` is another than the gateway's own when it speaks as a vehicle's onboard computer.
         """
         self._mav.srcSystem = self.system if system is None else system
         raw = bytes(message.pack(self._mav))
+        if self._v1:
+            raw = as_v1(raw)
+            if not raw:
+                return raw
         if self.signer is not None:
             raw = self._sign(raw, raw[7] | raw[8] << 8 | raw[9] << 16)
         self._mav.seq = (self._mav.seq + 1) % 256
         return raw
 
     def pass_on(self, frame: Frame) -> bytes:
-        """Return a frame of another link as this one sends it: its bytes, signed or unsigned as this link is."""
+        """Return a frame of another link as this one sends it: its bytes, signed or unsigned as this link is.
+
+        Empty where this link speaks MAVLink 1, which has no such message.
+        """
         raw = frame.raw
+        if self._v1:
+            return as_v1(raw)
         if self.signer is not None:
             return self._sign(as_v2(raw), frame.number)
         if raw[0] == MARKER_V2 and raw[2] & SIGNED_FLAG:
@@ -155,7 +173,7 @@ class Stream:
         self._rest = data[used:]
 
 
-def make(name: str, **fields: Any) -> Message:
+def make(name: str, /, **fields: Any) -> Message:
     """Make a message by its MAVLink name, such as `make("HEARTBEAT", type=..., ...)`."""
     if name == CommandCancel.name:
         return CommandCancel(**fields)

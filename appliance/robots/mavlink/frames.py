@@ -7,7 +7,7 @@ bytes of each good one.
 
 from msgspec import Struct
 
-from appliance.robots.mavlink.kinds import KINDS, Message, checksum, decode
+from appliance.robots.mavlink.kinds import KINDS, LAST_V1, Message, checksum, decode, plain_lengths
 from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG
 
 MARKER_V2 = 0xFD
@@ -106,3 +106,20 @@ def as_v2(raw: bytes) -> bytes:
     length, sequence, system, component, number = raw[1:6]
     header = bytes((MARKER_V2, length, 0, 0, sequence, system, component, number, 0, 0))
     return header + raw[_HEADER_V1:]
+
+
+def as_v1(raw: bytes) -> bytes:
+    """Return a frame as one of MAVLink 1, without extension fields and signature; empty where that has no such message.
+
+    Source: MAVLink guide, "Packet Serialization": there payloads always have their full length.
+    """
+    if raw[0] == MARKER_V1:
+        return raw
+    size, sequence, system, component = raw[1], raw[4], raw[5], raw[6]
+    number = raw[7] | raw[8] << 8 | raw[9] << 16
+    length = plain_lengths().get(number)
+    if number > LAST_V1 or length is None:
+        return b""
+    payload = raw[_HEADER_V2 : _HEADER_V2 + size].ljust(length, b"\0")[:length]
+    body = bytes((length, sequence, system, component, number)) + payload
+    return bytes((MARKER_V1,)) + body + checksum(body + KINDS[number].extra).to_bytes(2, "little")

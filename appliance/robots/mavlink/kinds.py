@@ -5,6 +5,7 @@ gateway itself acts on (`decode`): making pymavlink's objects costs several time
 Source: MAVLink guide, "Packet Serialization" (CRC extra, order of fields on the wire, payload truncation).
 """
 
+import functools
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -93,6 +94,24 @@ def _kind(number: int, message: Any) -> Kind:
 KINDS: dict[int, Kind] = _table()
 """By message number."""
 NAMES = frozenset(each.name for each in KINDS.values())
+
+LAST_V1 = 255
+"""MAVLink 1 has one byte for a message's number."""
+
+
+@functools.cache
+def plain_lengths() -> dict[int, int]:
+    """Return the payload lengths of the messages that MAVLink 1 has, by number: without extension fields.
+
+    From pymavlink's dialect of MAVLink 1, read when first asked for: it costs as much memory as that of MAVLink 2.
+    """
+    from pymavlink.dialects.v10 import ardupilotmega as v1  # noqa: PLC0415 - see above
+
+    classes: dict[int, Any] = v1.mavlink_map
+    found = {number: int(each.unpacker.size) for number, each in classes.items()}
+    found.setdefault(_CANCEL.number, 4)
+    return found
+
 
 _decoder: Any = _dialect.MAVLink(None)
 

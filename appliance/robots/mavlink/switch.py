@@ -224,7 +224,7 @@ class Switch:
 
         One that sets a vehicle's signing key is routed and not told: the key is in it (MAVLink, SETUP_SIGNING).
         """
-        if raw[0] == MARKER_V2 and raw[7:10] == SETUP_SIGNING:
+        if not raw or (raw[0] == MARKER_V2 and raw[7:10] == SETUP_SIGNING):
             return
         keys = self._session.keys
         key = keys.mavlink(vehicle, direction) if vehicle else keys.link_frames(self._gateway, str(end.link), direction)

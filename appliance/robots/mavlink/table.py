@@ -163,7 +163,7 @@ class LinkTable:
         rules = rules_of(setting)
         number = next(each for each in range(MAX_LINKS + 1) if each not in self._links)
         signer = await load_signer(setting, number, self._store)
-        codec = Codec(self._config.system_id, self._config.component_id, signer=signer)
+        codec = Codec(self._config.system_id, self._config.component_id, signer=signer, v1=setting.mavlink1)
 
         def receive(frame: Frame, address: Address) -> None:
             entry = self._links.get(number)

@@ -496,6 +496,46 @@ async def test_two_vehicles_with_one_system_id() -> None:
         assert made.attached == ("drone_1",)
 
 
+async def test_an_end_that_understands_mavlink_1_alone() -> None:
+    """It is a vehicle like others: what it is told, by the gateway or from another link, is in MAVLink 1."""
+    port, other = _port(), _port()
+    heard: list[bytes] = []
+
+    class Old(asyncio.DatagramProtocol):
+        def datagram_received(self, data: bytes, _: Any) -> None:
+            heard.append(data)
+
+    async with (
+        station(other, MavlinkLink(listen=f"udp://127.0.0.1:{port}", mavlink1=True)) as (made, refused),
+        sender(other) as ground,
+    ):
+        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(Old, remote_addr=("127.0.0.1", port))
+        try:
+            codec, watching = Codec(5, 1, v1=True), Codec(255, 190)
+            await until(lambda: made.attached, lambda: transport.sendto(codec.pack(make("HEARTBEAT", **BEAT))))
+            asked = make("COMMAND_INT", target_system=5, target_component=1, frame=3, command=192, current=0,
+                         autocontinue=0, param1=0, param2=0, param3=0, param4=0, x=7, y=8, z=0)  # fmt: skip
+            tunnel = {"payload_type": 1, "payload_length": 0, "payload": [0] * 128}
+            unknown = make("TUNNEL", target_system=5, target_component=1, **tunnel)
+
+            def act() -> None:
+                transport.sendto(codec.pack(make("HEARTBEAT", **BEAT)))
+                for message in (make("HEARTBEAT", **STATION), asked, unknown):
+                    ground(watching.pack(message))
+
+            def told() -> set[str]:
+                frames = [frame for raw in heard for frame in Codec(9, 9).read(raw)]
+                return {each.name for each in frames if isinstance(each, Frame)}
+
+            await until(lambda: refused.get("no_mavlink_1") and {"HEARTBEAT", "COMMAND_INT"} <= told(), act)
+            await until(lambda: "COMMAND_LONG" in told(), act)  # the gateway asks for its telemetry
+            assert {raw[0] for raw in heard} == {0xFE}
+            assert "TUNNEL" not in told()
+            assert all(payload for key, payload in cast("Wire", made._session).puts if "/mavlink/" in key)
+        finally:
+            transport.close()
+
+
 async def test_a_repetition_is_recorded_and_goes_no_further() -> None:
     """What comes twice stands in the log twice, under who said it, and another end gets it once."""
     port, other = _port(), _port()

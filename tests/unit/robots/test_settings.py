@@ -31,6 +31,7 @@ def test_names_of_systems() -> None:
         RobotsConfig(mavlink=(MavlinkLink(prefix="Drone "),)),
         RobotsConfig(mavlink=(MavlinkLink(), MavlinkLink(listen="udp://127.0.0.1:14550"))),
         RobotsConfig(mavlink=(MavlinkLink(listen="tcp://127.0.0.1:1", connect="tcp://127.0.0.1:2"),)),
+        RobotsConfig(mavlink=(MavlinkLink(mavlink1=True, signing="/some/key"),)),
         RobotsConfig(system_id=0),
     ],
 )

@@ -84,8 +84,13 @@ class Link(abc.ABC):
         """Close everything; a port is free when it returns."""
 
     def transmit(self, raw: bytes, to: Address) -> None:
-        """Send a frame as it is; links lose frames, so nothing is raised for one that cannot be sent."""
-        if self._write(raw, to):
+        """Send a frame as it is; links lose frames, so nothing is raised for one that cannot be sent.
+
+        One that has no form in the link's version of MAVLink is empty, and counted.
+        """
+        if not raw:
+            self.count("no_mavlink_1")
+        elif self._write(raw, to):
             self.stats.frames_out += 1
             self.stats.bytes_out += len(raw)
 
