@@ -230,12 +230,21 @@ async def test_mavsdk_asks_for_a_task(field: Field, free_ports: Ports) -> None:
         async for text in drone.mavlink_direct.message("STATUSTEXT"):
             texts.append(str(json.loads(text.fields_json)["text"]))  # noqa: PERF401 - read while it grows
 
+    async def ask(template: int) -> None:
+        fields = {"target_system": 1, "target_component": 191, "command": 31010, "confirmation": 0}
+        fields |= {f"param{number}": 0 for number in range(3, 8)} | {"param1": template, "param2": 30}
+        await drone.mavlink_direct.send_message(MavlinkMessage("COMMAND_LONG", 245, 190, 1, 191, json.dumps(fields)))
+
     listeners = [asyncio.create_task(hear()), asyncio.create_task(read())]
     try:
-        await asyncio.sleep(0.5)
-        fields = {"target_system": 1, "target_component": 191, "command": 31010, "confirmation": 0}
-        fields |= {f"param{number}": 0 for number in range(3, 8)} | {"param1": 7, "param2": 30}
-        await drone.mavlink_direct.send_message(MavlinkMessage("COMMAND_LONG", 245, 190, 1, 191, json.dumps(fields)))
+        # Its server says nothing of when it listens: what cannot be is asked for until both streams have told so.
+        async with asyncio.timeout(60):
+            while not (
+                any("no template 99" in each for each in texts) and any(each["result"] == 2 for each in answers)
+            ):
+                await ask(99)
+                await asyncio.sleep(0.2)
+        await ask(7)
         await until(lambda: any(each["command"] == 31010 and each["result"] == 0 for each in answers))
         (request,) = field.submitted
         assert request.instruction == "drone_1 film the yard for 30 seconds"
