@@ -50,8 +50,11 @@ def _named(paths: tuple[Path, ...]) -> None:
 
 def _select(paths: tuple[Path, ...], keys: tuple[str, ...], without: tuple[str, ...], since: str, until: str) -> Any:
     from appliance.record.edit import Select, instant, span
+    from appliance.record.expressions import check_expression
 
     _named(paths)
+    for each in (*keys, *without):
+        check_expression(each)
     if not since and not until:
         return Select(keys=keys, without=without)
     start_ns, end_ns = span(paths)

@@ -6,6 +6,8 @@ Zenoh's rules: `*` is one chunk, `**` any number of chunks (none too), `$*` any 
 import re
 from functools import lru_cache
 
+from appliance.errors import ConfigError
+
 
 @lru_cache(maxsize=1024)
 def compile_expression(expression: str) -> re.Pattern[str]:
@@ -19,6 +21,24 @@ def compile_expression(expression: str) -> re.Pattern[str]:
             body = "[^/]+" if chunk == "*" else "[^/]*".join(re.escape(part) for part in chunk.split("$*"))
             out += f"{body}(?:/|$)"
     return re.compile(out)
+
+
+def check_expression(expression: str) -> str:
+    """Return a key expression that a person has written; ConfigError for one that would never match what is meant.
+
+    Stars beside other text are those of a shell, not of Zenoh. Slashes are let through as they come: topics of other
+    writers begin with one.
+    """
+    wrong = not expression or any(
+        ("*" in chunk.replace("$*", "") and chunk not in ("*", "**")) or "$" in chunk.replace("$*", "") or "?" in chunk
+        for chunk in expression.split("/")
+    )
+    if wrong:
+        raise ConfigError(
+            f"{expression[:80]!r} is no key expression",
+            remedy="`*` is one chunk between slashes, `**` any number, `$*` any text within one: **/gw-$*/log",
+        )
+    return expression
 
 
 def matches(expression: str, key: str) -> bool:

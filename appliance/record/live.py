@@ -19,7 +19,7 @@ from appliance.errors import ConfigError, PrerequisiteError
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.record.about import About
-from appliance.record.expressions import compile_expression
+from appliance.record.expressions import check_expression, compile_expression
 from appliance.record.facts import LoggedMessage
 from appliance.record.foxglove import ChannelKind, Derive, Foxglove
 from appliance.record.openlog import JSON, LAST_NS
@@ -57,6 +57,8 @@ class LiveOptions(Struct, frozen=True, kw_only=True):
                 f"--host {self.host[:60]!r}: whoever connects sees everything, without a password",
                 remedy="listen on 127.0.0.1, and reach it through `ssh -L 8765:127.0.0.1:8765`",
             )
+        for each in self.keys:
+            check_expression(each)
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"--port {self.port}", remedy="give 0 (any) to 65535")
 

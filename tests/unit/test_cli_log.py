@@ -159,6 +159,8 @@ def _derived(log: Path) -> int:
         (("--remap", "nothing"), "is no rule"),
         (("--from", "yesterday"), "is no time"),
         (("--paused",), "needs a terminal"),
+        (("--key", "*task"), "is no key expression"),
+        (("--without", "**log"), "is no key expression"),
     ],
 )
 def test_replays_that_cannot_be(log: Path, swiftbot: Any, options: tuple[str, ...], told: str) -> None:
