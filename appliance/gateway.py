@@ -110,7 +110,10 @@ class Gateway:
         await self._start_robots(site, audit, orders)
 
         artifacts = Artifacts(
-            self._data / "artifacts", gateway=config.id, max_bytes=config.tasks.max_artifact_mb * 2**20
+            self._data / "artifacts",
+            gateway=config.id,
+            max_bytes=config.tasks.max_artifact_mb * 2**20,
+            reserve_bytes=config.tasks.artifact_reserve_mb * 2**20,
         )
         enquiries = Enquiries(self.plane)
         enquiries.start(audit)

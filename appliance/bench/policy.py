@@ -7,7 +7,7 @@ memory held idle. Figures depend on the seed alone, not on the machine; only `se
 
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -116,13 +116,28 @@ def _fewer(ours: float, theirs: float) -> float:
     return round(100 * (1 - ours / theirs), 1) if theirs else 0.0
 
 
+def on_frontier(mine: Point, others: Iterable[Point]) -> bool:
+    """Whether no other point, with no more memory for its containers, is better.
+
+    Better is by 5 % in one of the two (and by 0.1 % of the runs, less is chance), at most 2 % worse in the other.
+    """
+    return not any(
+        (
+            each.cold_percent < min(0.95 * mine.cold_percent, mine.cold_percent - 0.1)
+            and each.wasted_gb <= 1.02 * mine.wasted_gb
+        )
+        or (each.cold_percent <= 1.02 * mine.cold_percent and each.wasted_gb < 0.95 * mine.wasted_gb)
+        for each in others
+        if each.budget_mb <= mine.budget_mb
+    )
+
+
 def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
     """Return how the default stands: against keep-alive at equal memory, and on the frontier of the others.
 
     At each budget: `fewer_at_budget`, percent fewer cold starts than keep-alive with the same budget;
     `fewer_at_waste`, the same against keep-alive's curve where it wastes as much (None: it never wastes so much);
-    `on_frontier`, whether no point of another policy, with no more memory for its containers, is better by 5 % in one
-    of the two (and by 0.1 % of the runs, less is chance) at no more than 2 % worse in the other.
+    `on_frontier`, whether no point of another policy is better.
     """
     others = [each for name, curve in curves.items() if name not in {DEFAULT, CLAIRVOYANT, BY_NUMBER} for each in curve]
     most_gb = 1.02 * max(each.wasted_gb for each in curves[KEEP_ALIVE])
@@ -132,15 +147,7 @@ def compare(curves: dict[str, list[Point]]) -> dict[str, Any]:
             "fewer_at_waste": _fewer(mine.cold_percent, cold_at(curves[KEEP_ALIVE], mine.wasted_gb))
             if mine.wasted_gb <= most_gb
             else None,
-            "on_frontier": not any(
-                (
-                    each.cold_percent < min(0.95 * mine.cold_percent, mine.cold_percent - 0.1)
-                    and each.wasted_gb <= 1.02 * mine.wasted_gb
-                )
-                or (each.cold_percent <= 1.02 * mine.cold_percent and each.wasted_gb < 0.95 * mine.wasted_gb)
-                for each in others
-                if each.budget_mb <= mine.budget_mb
-            ),
+            "on_frontier": on_frontier(mine, others),
         }
         for mine, theirs in zip(curves[DEFAULT], curves[KEEP_ALIVE], strict=True)
     }
@@ -295,29 +302,36 @@ def in_a_fleet(
     """Return the default as it is shipped (federated) beside keep-alive, on each gateway of a fleet with equal memory.
 
     A gateway's load is that of the traces of one gateway; half of each image's runs come to its home, the others
-    anywhere. `fewer_at_budget` as in `compare`; memory held idle is told per gateway. `keep_alive_federated` is
-    keep-alive that looks on other gateways too: what is left then is the policy's own.
+    anywhere. `fewer_at_budget` as in `compare`; memory held idle is told per gateway. Every other policy is played
+    federated too (`keep_alive_federated` among them): what is left beside those is the default's own, and
+    `on_frontier` is said of it among those. `bound`: the fewest percent that anybody who starts on demand can have with
+    the memory of all gateways together, as if they were one.
     """
     chosen = policies()
+    ways = [("keep_alive", KEEP_ALIVE, "local"), ("keep_alive_federated", KEEP_ALIVE, "federated")]
+    ways += [(name, name, "federated") for name in chosen if name != KEEP_ALIVE]
     result: dict[str, Any] = {}
     for kind in kinds:
         trace = FLEET_TRACES[kind](seed)
         lines: dict[str, Any] = {"runs": len(trace.arrivals)}
-        for budget in budgets_mb:
+        progress(f"{FLEET} gateways: {kind}, bound")
+        bounds = least_cold_within(trace, [FLEET * each for each in budgets_mb])
+        seen: list[Point] = []
+        for budget, bound in zip(budgets_mb, bounds, strict=True):
             progress(f"{FLEET} gateways: {kind} with {budget} MB each")
             points: dict[str, Point] = {}
-            for name, policy, mode in (
-                ("keep_alive", KEEP_ALIVE, "local"),
-                ("keep_alive_federated", KEEP_ALIVE, "federated"),
-                (DEFAULT, DEFAULT, "federated"),
-            ):
+            for name, policy, mode in ways:
                 outcome = simulate(trace, replace(chosen[policy], memory_mb=budget, mode=mode), tick_s=10.0)
                 points[name] = point(trace, budget, outcome)
-            fewer = _fewer(points[DEFAULT].cold_percent, points["keep_alive"].cold_percent)
+            seen += [each for name, each in points.items() if name not in {"keep_alive", DEFAULT}]
             lines[str(budget)] = {
                 name: {"cold_percent": each.cold_percent, "wasted_gb": round(each.wasted_gb / FLEET, 3)}
                 for name, each in points.items()
-            } | {"fewer_at_budget": fewer}
+            } | {
+                "fewer_at_budget": _fewer(points[DEFAULT].cold_percent, points["keep_alive"].cold_percent),
+                "on_frontier": on_frontier(points[DEFAULT], seen),
+                "bound": round(100 * bound / len(trace.arrivals), 3),
+            }
         result[kind] = lines
     return result
 

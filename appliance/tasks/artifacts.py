@@ -5,9 +5,11 @@ until another gateway's handler asks for them, piece by piece over RPC. Content 
 attempt store the same file once.
 """
 
+import errno
 import hashlib
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -64,12 +66,20 @@ def bytes_by_gateway(value: object) -> dict[str, int]:
 
 
 class Artifacts:
-    """The files of one gateway, under `directory/ab/abcdef…`."""
+    """The files of one gateway, under `directory/ab/abcdef…`.
 
-    def __init__(self, directory: Path, *, gateway: str, max_bytes: int) -> None:
+    Args:
+        directory: where they lie.
+        gateway: this gateway's id.
+        max_bytes: largest file.
+        reserve_bytes: what stays free on the disk: a handler may store any number of files.
+    """
+
+    def __init__(self, directory: Path, *, gateway: str, max_bytes: int, reserve_bytes: int = 0) -> None:
         self._directory = directory
         self._gateway = gateway
         self._max_bytes = max_bytes
+        self._reserve_bytes = reserve_bytes
 
     def path(self, digest: str) -> Path:
         """Where a file of that SHA-256 is kept; PayloadError if it is not one."""
@@ -97,6 +107,7 @@ class Artifacts:
         temporary = ""
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
+            self._check_room(target.parent, len(data))
             handle, temporary = tempfile.mkstemp(dir=target.parent)
             with os.fdopen(handle, "wb") as out:
                 out.write(data)
@@ -110,6 +121,12 @@ class Artifacts:
                 f"{name} could not be stored: {error.strerror}", remedy=f"free space in {self._directory}"
             ) from error
         return digest
+
+    def _check_room(self, folder: Path, size: int) -> None:
+        """Raise OSError where a file of that size would take the reserve."""
+        left = max(0, shutil.disk_usage(folder).free - size)
+        if left < self._reserve_bytes:
+            raise OSError(errno.ENOSPC, f"{left:,} bytes would be left, {self._reserve_bytes:,} stay free")
 
     async def piece(self, ask: ArtifactAsk) -> ArtifactPiece:
         """Read a piece of a file kept here; NotFoundError when it is not."""
@@ -152,7 +169,10 @@ class Artifacts:
                 log.warning("artifact does not match its digest", artifact=digest, gateway=member)
                 damaged.append(member)
                 continue
-            await anyio.to_thread.run_sync(self._write, digest, data)
+            try:
+                await anyio.to_thread.run_sync(self._write, digest, data)
+            except RefusedError as error:
+                log.warning("artifact is not kept here as well", artifact=digest, reason=str(error))
             return data
         if damaged:
             raise PayloadError(f"artifact {digest[:12]}… from {', '.join(damaged)} does not match its digest")

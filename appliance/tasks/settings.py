@@ -39,6 +39,8 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """How long after its deadline, or after a cancel, a silent run is given up."""
     max_artifact_mb: int = 64
     """Largest file a handler may store."""
+    artifact_reserve_mb: Annotated[int, Meta(ge=0)] = 512
+    """Disk left free where handlers' files are kept, MB: one that would take it is refused."""
     max_result_bytes: int = 48 * 1024
     """Largest result of a subtask, as JSON: 64 of them still fit into one record. Larger things are files."""
     max_checkpoint_bytes: int = 256 * 1024

@@ -96,6 +96,11 @@ def run(ctx):
             (ctx.volume("keep") / str(number)).write_bytes(bytes(4 * 2**20))
         while True:
             pass
+    if do == "fill beside the socket":
+        for number in range(64):
+            Path(f"/run/swiftbot/{{number}}").write_bytes(bytes(2**18))
+            time.sleep(0.02)
+        time.sleep(60)
     if do == "write a little":
         (ctx.volume("keep") / "little").write_bytes(bytes(2**20))
         return {{"left": sorted(os.listdir(ctx.volume("keep")))[:1]}}
@@ -314,13 +319,25 @@ async def test_a_volume_is_filled_without_end(bench: Bench, do: str) -> None:
     final = await bench.run(pool, do, next(NUMBERS), deadline_s=60.0)
     assert final.failure is not None
     assert (final.failure.code, final.failure.retryable) == ("disk", True), final.failure
-    assert "the disk of its volumes is nearly full" in final.failure.message
+    assert "into its volumes, whose disk is nearly full" in final.failure.message
     assert "make room on the disk" in final.failure.remedy
     await bench.ready(pool)
     after = await bench.run(pool, "write a little", next(NUMBERS))
     assert after.kind is RunEventKind.SUCCEEDED, after.failure
     assert after.container == final.container
     await pool.stop(keep_containers=False)
+
+
+async def test_what_is_written_beside_the_socket(bench: Bench, pool: Pool) -> None:
+    """The folder of the runner's socket is the gateway's: who fills it is ended, and what was written there is gone."""
+    await bench.ready(pool)
+    final = await bench.run(pool, "fill beside the socket", next(NUMBERS), deadline_s=60.0)
+    assert final.failure is not None
+    assert final.failure.code == "disk", final.failure
+    after = await _next_run_works(bench, pool)
+    assert after.container == final.container
+    (folder,) = (bench.folder / "run" / bench.fleet / "g1").iterdir()
+    assert {each.name for each in folder.iterdir()} == {"runner.sock", "spec.json"}
 
 
 async def test_a_neighbour_is_not_touched(bench: Bench) -> None:

@@ -44,7 +44,7 @@ REASONS = {1: "cancelled", 2: "deadline", 3: "orphaned", 4: "stopped", 5: "disk"
 SLOW = "raise timeout_s in its skill.toml, or find out what it waits for"
 FULL = "remove from its volumes what is not needed any more, have it write less, or make room on the disk"
 REMEDIES = {"deadline": SLOW, "disk": FULL}
-TEXTS = {"disk": "the disk of its volumes is nearly full, and it had written much there"}
+TEXTS = {"disk": "it had written much into its volumes, whose disk is nearly full, or beside its runner's socket"}
 LARGE = "put large things with ctx.put_artifact and return the reference"
 BROKEN = "its last lines are in the log: mend its handler"
 

@@ -9,6 +9,7 @@ import shutil
 import signal
 import socket
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 from . import child
@@ -183,8 +184,13 @@ class Run:
         return left.decode("utf-8", "replace").strip().splitlines()[-8:]
 
 
-def sweep_container() -> None:
-    """Remove every process and every file that a run has left in this container; for its process 1 only."""
+def sweep_container(beside: Path, own: Collection[str]) -> None:
+    """Remove every process and every file that a run has left in this container; for its process 1 only.
+
+    Args:
+        beside: the folder of the socket, which is the gateway's.
+        own: what is to stay there.
+    """
     until = time.monotonic() + SWEEP_S
     while _others() and time.monotonic() < until:
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -194,8 +200,10 @@ def sweep_container() -> None:
                 """What a run leaves behind comes to process 1."""
         if _others():
             time.sleep(0.001)
-    for folder in ("/tmp", "/dev/shm"):  # noqa: S108 - this container's own
-        for entry in Path(folder).iterdir():
+    for folder in (Path("/tmp"), Path("/dev/shm"), beside):  # noqa: S108 - this container's own
+        for entry in folder.iterdir():
+            if folder == beside and entry.name in own:
+                continue
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry, ignore_errors=True)
             else:

@@ -55,7 +55,9 @@ class Zygote:
         self._scratch = scratch
         self._processes = processes
         self._alone = os.getpid() == 1
-        self._disk = Disk(loaded.spec.volumes, reserve_mb=loaded.spec.reserve_mb)
+        self._disk = Disk(loaded.spec.volumes, beside=Path(path).parent, reserve_mb=loaded.spec.reserve_mb)
+        self._own: frozenset[str] = frozenset()
+        """What lies beside the socket and is to stay there."""
         self._connections: dict[int, Connection] = {}
         self._run: Run | None = None
         self._ahead: Run | None = None
@@ -82,6 +84,7 @@ class Zygote:
         listener.bind(early)
         listener.listen(MAX_CONNECTIONS)
         Path(early).rename(self._path)
+        self._own = frozenset(each.name for each in Path(self._path).parent.iterdir())
         self._epoll.register(wake, select.EPOLLIN)
         self._epoll.register(listener, select.EPOLLIN)
         self._fork_ahead()
@@ -119,7 +122,7 @@ class Zygote:
         if self._run is None:
             return 60.0
         left_s = max(0.0, self._run.due() - monotonic()) + 0.001
-        return min(left_s, LOOK_S) if self._disk.watched else left_s
+        return min(left_s, LOOK_S)
 
     # --- connections ------------------------------------------------------------------------------------------
 
@@ -315,7 +318,7 @@ class Zygote:
         with contextlib.suppress(OSError, ValueError):
             self._epoll.unregister(peer)
         if self._alone:
-            sweep_container()
+            sweep_container(Path(self._path).parent, self._own)
         else:
             shutil.rmtree(run.kit.scratch, ignore_errors=True)
         peer.close()  # end of file tells the gateway that the container is free again

@@ -12,6 +12,7 @@ from appliance.bench.policy import (
     cold_at,
     compare,
     in_a_fleet,
+    on_frontier,
     on_traces,
     over_gateways,
     run,
@@ -74,6 +75,20 @@ def test_the_shipped_default_beside_keep_alive_in_a_fleet(monkeypatch: pytest.Mo
     line = in_a_fleet(("bursts",), (1024,), seed=1)["bursts"]["1024"]
     assert line["fewer_at_budget"] >= 30
     assert line[DEFAULT]["wasted_gb"] <= line["keep_alive"]["wasted_gb"]
+    assert 0 < line["bound"] <= line["keep_alive_federated"]["cold_percent"]
+    assert {"lru", "greedy-dual", "histogram", "learned"} < set(line)
+    assert isinstance(line["on_frontier"], bool)
+
+
+def test_what_counts_as_the_frontier() -> None:
+    """Better in one at about the same of the other, with no more memory for containers; less than 0.1 % is chance."""
+    mine = point(2048, 10.0, 1.0)
+    assert on_frontier(mine, [])
+    assert not on_frontier(mine, [point(2048, 9.0, 1.01)])
+    assert not on_frontier(mine, [point(1024, 10.1, 0.9)])
+    assert on_frontier(mine, [point(4096, 9.0, 1.01)]), "it may hold more"
+    assert on_frontier(mine, [point(2048, 9.0, 1.1), point(2048, 11.0, 0.5), point(2048, 9.8, 0.99)])
+    assert on_frontier(point(2048, 0.2, 1.0), [point(2048, 0.12, 1.0)])
 
 
 @pytest.mark.thorough

@@ -23,7 +23,9 @@ def volumes(tmp_path: Path) -> Path:
 
 def watch(folder: Path, *, reserve_mb: int = ALL_MB) -> Disk:
     """Return a watch of a run that begins, and the kernel's next tick, by which files are stamped, has come."""
-    it = Disk(folder, reserve_mb=reserve_mb)
+    beside = folder.parent / "beside"
+    beside.mkdir(exist_ok=True)
+    it = Disk(folder, beside=beside, reserve_mb=reserve_mb)
     it.begin()
     clock = folder.parent / "clock"
     while True:
@@ -36,7 +38,6 @@ def test_who_writes_much_while_the_disk_is_short_has_to_end(tmp_path: Path) -> N
     """Only what the run itself wrote counts, in all folders of all volumes together; a little may always be written."""
     folder = volumes(tmp_path)
     it = watch(folder)
-    assert it.watched
     assert not it.overrun(0.0), "what was there before is not the run's"
     (folder / "notes" / "deep" / "a").write_bytes(bytes((OWN_MB - 2) * 2**20))
     assert not it.overrun(10.0)
@@ -44,24 +45,48 @@ def test_who_writes_much_while_the_disk_is_short_has_to_end(tmp_path: Path) -> N
     assert it.overrun(20.0)
 
 
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Count how often the volumes are gone through."""
+    real, walks = Disk._written, []
+
+    def written(self: Disk, folders: list[Path], most_mb: int, most_files: int) -> bool:
+        walks.extend(each.name for each in folders if each.name == "maps")
+        return real(self, folders, most_mb, most_files)
+
+    monkeypatch.setattr(Disk, "_written", written)
+    return walks
+
+
 def test_where_there_is_room_nothing_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Enough is left: files are not even counted, however much the run writes."""
+    """Enough is left: the volumes are not even gone through, however much the run writes."""
     folder = volumes(tmp_path)
+    walks = counted(monkeypatch)
     it = watch(folder, reserve_mb=1)
     (folder / "notes" / "a").write_bytes(bytes(2 * OWN_MB * 2**20))
-    monkeypatch.setattr(Disk, "_written", lambda _: pytest.fail("it looked"))
     assert not it.overrun(0.0)
+    assert not walks
 
 
 def test_files_are_looked_at_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While the disk is short the volumes are gone through now and then, not at each look."""
     it = watch(volumes(tmp_path))
-    walks: list[float] = []
-    monkeypatch.setattr(Disk, "_written", lambda _: bool(walks.append(0.0)))
+    walks = counted(monkeypatch)
     for tenths in range(25):
         it.overrun(tenths / 10)
     assert len(walks) == 3
     assert WALK_S == 1.0
+
+
+def test_beside_the_socket_nothing_is_to_be_written(tmp_path: Path) -> None:
+    """There a megabyte is too much however much room there is, with volumes or without."""
+    (tmp_path / "none").mkdir()
+    for folder in (volumes(tmp_path), tmp_path / "none"):
+        it = watch(folder, reserve_mb=0)
+        assert not it.overrun(0.0)
+        (tmp_path / "beside" / "a").write_bytes(bytes(2**19))
+        assert not it.overrun(1.0)
+        (tmp_path / "beside" / "b").write_bytes(bytes(2**20))
+        assert it.overrun(2.0)
 
 
 @pytest.mark.parametrize("bound", ["OWN_FILES", "MOST_WALKED"])
@@ -92,13 +117,13 @@ def test_what_is_hidden_counts_as_written(tmp_path: Path) -> None:
     assert not watch(folder).overrun(0.0)
 
 
-def test_without_volumes_nothing_is_watched(tmp_path: Path) -> None:
-    """No volume, or no reserve: the zygote does not wake for it."""
-    (tmp_path / "none").mkdir()
-    for it in (Disk(tmp_path / "none", reserve_mb=1), Disk(tmp_path / "not there", reserve_mb=1)):
-        assert not it.watched
-        assert not it.overrun(0.0)
-    assert not Disk(volumes(tmp_path), reserve_mb=0).watched
+def test_volumes_without_a_reserve(tmp_path: Path) -> None:
+    """With a reserve of 0 volumes are not watched, nor where there are none."""
+    folder = volumes(tmp_path)
+    it = watch(folder, reserve_mb=0)
+    (folder / "notes" / "a").write_bytes(bytes(2 * OWN_MB * 2**20))
+    assert not it.overrun(0.0)
+    assert not Disk(tmp_path / "not there", beside=tmp_path / "not there either", reserve_mb=1).overrun(0.0)
 
 
 def test_inodes_that_run_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,3 +84,25 @@ async def test_a_full_disk_is_an_error_that_names_the_place(tmp_path: Path) -> N
     with pytest.raises(RefusedError, match="could not be stored") as caught:
         await store(tmp_path).put("a", b"x", "text/plain")
     assert str(blocked) in caught.value.remedy
+
+
+async def test_files_without_end_leave_the_disk_its_reserve(tmp_path: Path) -> None:
+    """Where less than the reserve would be left a file is refused, told why, and nothing of it lies there."""
+    files = Artifacts(tmp_path / "gw-1", gateway="gw-1", max_bytes=100, reserve_bytes=2**60)
+    with pytest.raises(RefusedError, match="stay free") as caught:
+        await files.put("a", b"x", "text/plain")
+    assert str(tmp_path) in caught.value.remedy
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+async def test_what_cannot_be_kept_here_is_given_all_the_same(tmp_path: Path) -> None:
+    """A file of another gateway reaches the handler that asked for it, though this gateway has no room for a copy."""
+    maker = store(tmp_path, "gw-1")
+    here = Artifacts(tmp_path / "gw-2", gateway="gw-2", max_bytes=100, reserve_bytes=2**60)
+    reference = msgspec.to_builtins(await maker.put("a", b"picture", "image/png"))
+
+    async def ask(member: str, piece: ArtifactAsk) -> ArtifactPiece:
+        return await maker.piece(piece)
+
+    assert await here.get(reference, ask=ask, members=frozenset({"gw-1", "gw-2"})) == b"picture"
+    assert not here.path(reference["artifact"]).exists()

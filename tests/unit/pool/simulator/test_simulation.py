@@ -3,6 +3,7 @@
 import pytest
 from msgspec.structs import replace
 
+from appliance.bench.policy import policies
 from appliance.pool.settings import PoolConfig
 from appliance.pool.simulator import Arrival, Image, Outcome, Trace, simulate
 from appliance.pool.simulator.clairvoyant import Belady, cold_with_foresight, least_cold, least_cold_within
@@ -141,3 +142,30 @@ def test_the_bound_falls_with_the_budget() -> None:
     assert bounds == sorted(bounds, reverse=True)
     assert bounds[-1] == least_cold(trace, [1e18])[0]
     assert bounds[0] >= 0.95 * len(trace.arrivals)
+
+
+@pytest.mark.parametrize("name", list(policies()))
+@pytest.mark.parametrize("kind", ["poisson", "bursts", "diurnal", "timer"])
+def test_each_policy_on_each_kind_of_arrivals(kind: str, name: str) -> None:
+    """No run is unaccounted for, no memory beyond the budget is held, and all have far fewer cold starts than none."""
+    trace = plain(kind, seed=7, images=12, duration_s=1800.0, rate=0.3)
+    budget_mb = 2048
+    outcome = simulate(trace, replace(policies()[name], memory_mb=budget_mb), tick_s=5.0)
+    assert outcome.runs == len(trace.arrivals) == outcome.local + outcome.cold + outcome.lost
+    assert outcome.remote == 0
+    assert _accounted(outcome, budget_mb / 1024, trace.duration_s)
+    assert 0 < outcome.cold < 0.7 * outcome.runs
+    assert outcome.cold_rate == outcome.cold / outcome.runs
+
+
+def test_a_thousand_gateways() -> None:
+    """The same deciders at a thousand gateways: every run is accounted for, and what others have spares cold starts."""
+    trace = plain("poisson", seed=3, images=24, rate=50.0, duration_s=60.0, gateways=1000)
+    assert len({each.gateway for each in trace.arrivals}) > 700
+    settings = replace(PoolConfig(floor={}), memory_mb=2048, capacity=64)
+    alone = simulate(trace, replace(settings, mode="local"), tick_s=10.0)
+    together = simulate(trace, replace(settings, mode="federated"), tick_s=10.0)
+    for outcome in (alone, together):
+        assert outcome.runs == len(trace.arrivals)
+        assert outcome.runs == outcome.local + outcome.remote + outcome.cold + outcome.lost
+    assert together.cold < 0.5 * alone.cold
