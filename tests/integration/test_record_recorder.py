@@ -18,6 +18,7 @@ from appliance.errors import RecordError
 from appliance.model import GatewayStatus, Notice, encode
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
+from appliance.record.asking import trigger
 from appliance.record.edit import recover
 from appliance.record.facts import Gap, LoggedMessage, RecorderStatus
 from appliance.record.reader import info, read
@@ -65,7 +66,7 @@ async def _recording(gateway: Session, config: RecordConfig) -> AsyncIterator[Re
     try:
         await recorder.start()
         await asyncio.wait_for(heard.wait(), 60)
-        while recorder.stats.messages == 0:  # its subscription has reached the gateway when a put comes back
+        while not recorder.stats.messages + recorder.stats.held:  # its subscription is there when a put comes back
             gateway.put(f"{gateway.keys.root}/probe", b"{}")
             await asyncio.sleep(0.05)
         yield recorder
@@ -109,6 +110,33 @@ async def test_what_is_put_is_read_back(gateway: Session, tmp_path: Path) -> Non
     assert summary.statistics is not None
     assert summary.statistics.message_count == told.messages
     assert "swiftbot.GatewayStatus" in {schema.name for schema in summary.schemas.values()}
+
+
+async def test_what_somebody_asks_for_is_written_with_what_came_before(gateway: Session, tmp_path: Path) -> None:
+    """`swiftbot log trigger` over the network: seconds before it are in the file, in order, and its reason is told.
+
+    Until then nothing is written; the recorder that confirms is the answer, and where there is none nobody is.
+    """
+    keys = gateway.keys
+    assert await trigger("f1", gateway.config.listen, "odd noise", by="kim", wait_s=0.3) == []
+    config = RecordConfig(directory=str(tmp_path), mode="incidents", before_s=60.0, after_s=60.0, status_s=0.1)
+    async with _recording(gateway, config) as recorder:
+        for number in range(300):
+            gateway.put(keys.transition("t1"), encode({"n": number}))
+        await _until(lambda: recorder.stats.held >= 300)
+        assert not list(tmp_path.glob("*.mcap"))
+        (told,) = await trigger("f1", gateway.config.listen, "odd noise", by="kim", wait_s=60.0)
+        assert (told.id, told.incidents) == ("recorder", 1)
+        assert "odd noise (by kim)" in told.last_incident
+        for number in range(300, 400):
+            gateway.put(keys.transition("t1"), encode({"n": number}))
+        await _until(lambda: recorder.stats.messages >= 400)
+    (path,) = tmp_path.glob("*.mcap")
+    found = [msgspec.json.decode(each.payload)["n"] for each in read(path, keys=keys.transition())]
+    assert found == list(range(400))
+    (incident,) = info(path).incidents
+    assert (incident.reason, incident.detail) == ("asked", "odd noise (by kim)")
+    assert incident.before_s > 0
 
 
 async def test_status_is_put(gateway: Session, tmp_path: Path) -> None:
