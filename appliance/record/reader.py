@@ -22,6 +22,8 @@ from appliance.record.writer import METADATA
 
 _GAPS = compile_expression("swiftbot/*/recorder/*/gap")
 _INCIDENTS = compile_expression("swiftbot/*/recorder/*/incident")
+_MALFORMED = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+"""What a stranger's put on the recorder's own keys raises: it is a message like others then."""
 _DELETIONS = compile_expression("swiftbot/*/recorder/*/deleted")
 
 
@@ -91,7 +93,7 @@ def logged(channel: Channel, message: Message) -> LoggedMessage:
     if _DELETIONS.fullmatch(channel.topic):
         try:
             deletion = msgspec.json.decode(message.data, type=Deletion)
-        except msgspec.MsgspecError:
+        except _MALFORMED:
             pass  # a stranger's put on that key: give it as it is
         else:
             return LoggedMessage(deletion.key, message.log_time, b"", "", deleted=True)
@@ -109,7 +111,7 @@ class _Account:
     def gap(self, data: bytes) -> None:
         try:
             gap = msgspec.json.decode(data, type=Gap)
-        except msgspec.MsgspecError:
+        except _MALFORMED:
             return
         if gap.source:
             self.not_heard += gap.dropped
@@ -117,7 +119,7 @@ class _Account:
             self.dropped += gap.dropped
 
     def incident(self, data: bytes) -> None:
-        with contextlib.suppress(msgspec.MsgspecError):
+        with contextlib.suppress(*_MALFORMED):
             self.incidents.append(msgspec.json.decode(data, type=Incident))
 
     def take(self, topic: str, data: bytes) -> None:

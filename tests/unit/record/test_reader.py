@@ -12,7 +12,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 from appliance.errors import NotFoundError, RecordError
 from appliance.model import LogLine, encode
 from appliance.plane.keys import Keys
-from appliance.record.edit import recover
+from appliance.record.cat import cat
+from appliance.record.edit import Select, recover
 from appliance.record.facts import LoggedMessage
 from appliance.record.openlog import Attached
 from appliance.record.reader import info, read
@@ -124,6 +125,26 @@ def test_chunk_that_claims_the_memory(scratch: Path) -> None:
     problems: list[str] = []
     list(read(scratch, problems=problems))
     assert any("claims 1099511627776 bytes" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("payload", [b"[" * 100_000, b'{"a":' * 100_000, b"\xff\xfe", b'{"dropped":1e999}', b""])
+def test_what_a_stranger_puts_on_the_recorders_keys(tmp_path: Path, payload: bytes) -> None:
+    """A bomb where gaps, incidents and deletions are told: it is told, read and copied as what it is, and no crash."""
+    writer = LogWriter(RecordConfig(directory=str(tmp_path), free_bytes=0, fsync=False), fleet="f1")
+    writer.prepare()
+    keys = Keys("f1")
+    own = [keys.recorder_gap("x"), keys.recorder_incident("x"), keys.recorder_deleted("x")]
+    for key in (*own, keys.log("g1"), keys.robot("r1"), keys.transition("t1"), keys.task("t1")):
+        writer.write(LoggedMessage(key, 5, payload, "application/json"))
+    writer.close()
+    (log,) = writer.files
+    assert info(log).messages == info(log, verify=True).messages == 7
+    assert (info(log).dropped, info(log).incidents) == (0, ())
+    assert [each.payload for each in read(log)] == [payload] * 7
+    assert recover(log, tmp_path / "again.mcap").messages == 7
+    lines: list[str] = []
+    assert cat([log], Select(), as_json=True, write=lines.append) == []
+    assert len(lines) == 7
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89", b"garbage, and enough of it to look at", b"\0" * 4096])
