@@ -17,7 +17,7 @@ from mcap.summary import Summary
 from appliance.errors import RecordError
 from appliance.record.expressions import compile_expression
 from appliance.record.facts import ChannelInfo, Deletion, Gap, Incident, LoggedMessage, LogInfo
-from appliance.record.records import BROKEN, RecordStream, open_log
+from appliance.record.records import BROKEN, RecordStream, chunk_at, open_log
 from appliance.record.writer import METADATA
 
 _GAPS = compile_expression("swiftbot/*/recorder/*/gap")
@@ -184,9 +184,13 @@ def _from_index(path: Path) -> LogInfo | None:
             assert summary.statistics is not None  # noqa: S101 - _complete has seen it
             counts = summary.statistics.channel_message_counts
             account = _Account()
-            if told := {channel.topic for channel in summary.channels.values() if _is_told(channel.topic)}:
-                for _, channel, message in reader.iter_messages(topics=told):
-                    account.take(channel.topic, message.data)
+            told = {number: channel.topic for number, channel in summary.channels.items() if _is_told(channel.topic)}
+            for index in sorted(summary.chunk_indexes, key=lambda each: each.chunk_start_offset):
+                if not told or (index.message_index_offsets and told.keys().isdisjoint(index.message_index_offsets)):
+                    continue  # not of what is told; where the messages have no index, every chunk may be
+                for record in chunk_at(stream, index.chunk_start_offset):
+                    if isinstance(record, Message) and record.channel_id in told:
+                        account.take(told[record.channel_id], record.data)
             metadata: dict[str, str] = {}
             for found in reader.iter_metadata():
                 if found.name == METADATA:

@@ -6,19 +6,21 @@ the end of the file and each chunk checked against its checksum, so a message is
 or it is reported as damage, and what follows is still read.
 """
 
+import dataclasses
 import io
 import os
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 
 from appliance.errors import NotFoundError, RecordError
@@ -131,14 +133,10 @@ class RecordStream:
 
     def _chunk(self, body: bytes, start: int) -> Iterator[Record]:
         try:
-            chunk = Chunk.read(ReadDataStream(io.BytesIO(body)))
-            claimed = chunk.uncompressed_size
-            if chunk.compression == "zstd":
-                claimed = max(claimed, zstandard.frame_content_size(chunk.data))
-            if claimed > CHUNK_LIMIT:
-                self.problems.append(f"chunk at byte {start} claims {claimed} bytes, more than is taken")
-                return
-            records = breakup_chunk(chunk, validate_crc=True)
+            records = unpacked(body)
+        except TooLarge as error:
+            self.problems.append(f"chunk at byte {start} {error}, more than is taken")
+            return
         except BROKEN as error:
             self.problems.append(f"chunk at byte {start} is damaged ({_why(error)}): its messages are lost")
             return
@@ -162,6 +160,41 @@ class RecordStream:
         if problem not in self.problems:
             self.problems.append(problem)
         return False
+
+
+class TooLarge(ValueError):  # noqa: N818 - what it says
+    """A chunk that unpacks to more than is taken, or says so."""
+
+
+def unpacked(body: bytes) -> list[McapRecord]:
+    """Return the records of a chunk, checked against its checksum.
+
+    Whatever it says of its size, no more than `CHUNK_LIMIT` is unpacked: one of BROKEN is raised, TooLarge among them.
+    """
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(body)))
+    claimed = chunk.uncompressed_size
+    if chunk.compression == "zstd":  # which unpacks to what one of the two says, or fails
+        claimed = max(claimed, zstandard.frame_content_size(chunk.data))
+    if claimed > CHUNK_LIMIT:
+        raise TooLarge(f"claims {claimed} bytes")
+    if chunk.compression == "lz4":  # which unpacks to whatever is in it
+        unpacking: Any = lz4.frame.LZ4FrameDecompressor()
+        plain = bytes(unpacking.decompress(chunk.data, max_length=CHUNK_LIMIT + 1))
+        if len(plain) > CHUNK_LIMIT:
+            raise TooLarge(f"has more than {CHUNK_LIMIT} bytes in it")
+        if not unpacking.eof:
+            raise ValueError("what is packed in it is not whole")
+        chunk = dataclasses.replace(chunk, compression="", data=plain)
+    return breakup_chunk(chunk, validate_crc=True)
+
+
+def chunk_at(stream: BinaryIO, offset: int) -> list[McapRecord]:
+    """Return the records of the chunk at a place that an index names; one of BROKEN where there is none."""
+    stream.seek(offset)
+    opcode, length = _FRAME.unpack(stream.read(_FRAME.size))
+    if opcode != Opcode.CHUNK or length > os.fstat(stream.fileno()).st_size - stream.tell():
+        raise ValueError("there is no chunk where the index has one")
+    return unpacked(stream.read(length))
 
 
 def _empty_message(body: bytes) -> Message:

@@ -1,8 +1,11 @@
 """Reading logs in whatever state they are in."""
 
 import io
+import struct
+import tracemalloc
 from pathlib import Path
 
+import lz4.frame
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,6 +15,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from appliance.errors import NotFoundError, RecordError
 from appliance.model import LogLine, encode
 from appliance.plane.keys import Keys
+from appliance.record import records
 from appliance.record.cat import cat
 from appliance.record.edit import Select, recover
 from appliance.record.facts import LoggedMessage
@@ -125,6 +129,61 @@ def test_chunk_that_claims_the_memory(scratch: Path) -> None:
     problems: list[str] = []
     list(read(scratch, problems=problems))
     assert any("claims 1099511627776 bytes" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD])
+def test_a_chunk_that_unpacks_to_the_memory(
+    tmp_path: Path, compression: CompressionType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever it claims, a chunk is unpacked up to the limit, also one that the index says has gaps in it."""
+    monkeypatch.setattr(records, "CHUNK_LIMIT", 2**20)
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=2**30, compression=compression)
+    writer.start()
+    channel = writer.register_channel(Keys("f1").recorder_gap("x"), "json", 0)
+    writer.add_message(channel, 1, bytes(2**26), 1)
+    writer.finish()
+    data = out.getvalue()
+    assert len(data) < 2**19
+    log = tmp_path / "bomb.mcap"
+    name = compression.name.lower().encode()
+    at = data.index(len(name).to_bytes(4, "little") + name) - 12
+    for claim in (2**26, 100):
+        log.write_bytes(data[:at] + claim.to_bytes(8, "little") + data[at + 8 :])
+        tracemalloc.start()
+        try:
+            problems: list[str] = []
+            assert list(read(log, problems=problems)) == []
+            told = info(log)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert any("chunk at byte" in each for each in problems), problems
+        assert told.problems
+        assert peak < 2**24
+    with pytest.raises(RecordError, match="chunk at byte"):
+        list(read(log))
+
+
+def test_lz4_that_is_cut_is_damage(scratch: Path) -> None:
+    """A chunk whose packed data ends before its end costs its messages, and is told, without a checksum too."""
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=10_000, compression=CompressionType.NONE, enable_crcs=False)
+    writer.start()
+    channel = writer.register_channel("k", "json", 0)
+    for number in range(20):
+        writer.add_message(channel, number + 1, b"x" * 50, number + 1)
+    writer.finish()
+    plain = out.getvalue()
+    start = plain.index(b"\x06")  # the chunk's opcode
+    (length,) = struct.unpack_from("<Q", plain, start + 1)
+    body = plain[start + 9 : start + 9 + length]
+    head, packed = body[:28], lz4.frame.compress(body[40:])[:-20]
+    chunk = head + b"\x03\x00\x00\x00lz4" + struct.pack("<Q", len(packed)) + packed
+    scratch.write_bytes(plain[:start] + b"\x06" + struct.pack("<Q", len(chunk)) + chunk)
+    problems: list[str] = []
+    assert list(read(scratch, problems=problems)) == []
+    assert any("is damaged" in each for each in problems), problems
 
 
 @pytest.mark.parametrize("payload", [b"[" * 100_000, b'{"a":' * 100_000, b"\xff\xfe", b'{"dropped":1e999}', b""])
