@@ -174,14 +174,16 @@ class FleetClient(SteeringCalls):
         signed = replace(ask, by=ask.by or self.operator)
         return await self.plane.rpc.call(gateway, "pool_warm", signed, Warmed, timeout_s=ask.wait_s + 5.0)
 
-    async def image_fetch(self, gateway: str, reference: str, source: str = "", *, timeout_s: float = 900.0) -> Brought:
+    async def image_fetch(
+        self, gateway: str, reference: str, source: str = "", *, timeout_s: float = 900.0, why: str = ""
+    ) -> Brought:
         """Have a gateway bring an image to itself, from `source` first; returns when it is there.
 
         Raises:
             NotFoundError: no gateway that answers has it.
         """
         await self._known(gateway)
-        ask = FetchAsk(reference=reference, gateway=source)
+        ask = FetchAsk(reference=reference, gateway=source, **self._sign(why))
         return await self.plane.rpc.call(gateway, "image_fetch", ask, Brought, timeout_s=timeout_s)
 
     def image_holders(self, reference: str) -> tuple[str, ...]:

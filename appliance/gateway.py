@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 import structlog
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance import logs, service
 from appliance.config import GatewayConfig
@@ -130,7 +131,7 @@ class Gateway:
             config.pool, plane=self.plane, fleet=config.fleet, data_dir=self._data, on_change=self._changed.set
         )
         self._stack.push_async_callback(storage.close)
-        await storage.open()
+        await storage.open(audit.signed)
         self._remote = remote = RemoteContainers(
             self.plane, successors=config.plane.find_successors, links=storage.links
         )
@@ -327,6 +328,7 @@ class Gateway:
         self.plane.session.put(self.plane.keys.decided(self.config.id, what), msgspec.json.encode(case))
 
     def _put_log(self, line: LogLine) -> None:
+        line = line if line.source else replace(line, source=self.config.id)
         self._kept.hear_log(line)
         self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
 

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import structlog
 
@@ -43,8 +44,12 @@ class StateHere:
         self._transfers: Transfers | None = None
         self._stack = contextlib.AsyncExitStack()
 
-    async def open(self) -> None:
-        """Build and start the parts."""
+    async def open(self, signed: Callable[[str, Any], Any] = lambda _, handler: handler) -> None:
+        """Build and start the parts.
+
+        Args:
+            signed: puts an audit around the handler of an operator's verb.
+        """
         try:
             storage = PodmanStorage(self._config.podman_url)
         except PrerequisiteError as error:
@@ -67,7 +72,7 @@ class StateHere:
         self._transfers = transfers = Transfers(
             settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data
         )
-        await transfers.start()
+        await transfers.start(signed)
         self._stack.push_async_callback(transfers.close)
         transfers.on_change = self._on_change
         self.state = State(

@@ -124,6 +124,10 @@ class SteeringCalls(FleetConnection):
 
     # --- robots -------------------------------------------------------------------------------------------------
 
+    def knows_robot(self, name: str) -> bool:
+        """Whether a robot of that name has been heard of here."""
+        return name in self.plane.registry.robots
+
     async def stop(self, robots: Sequence[str] = (), *, why: str = "") -> StopAnswer:
         """Soft stop of some robots, or of the fleet: they hold, and are given no command until `resume_robots`.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import HERE, TOOLS, Json, Where, show
+from appliance.cli.common import HERE, TOOLS, Json, Where, Why, show
 
 images_app = App(name="images", help="Images that skills run in.", group=TOOLS)
 
@@ -75,6 +75,7 @@ def images_fetch(
     *,
     source: Annotated[str, Parameter(name="--from", help="Gateway to ask first; any that has it otherwise.")] = "",
     gateway: Annotated[str, Parameter(help="Gateway that fetches it; the one that is linked to otherwise.")] = "",
+    why: Why = "",
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -84,6 +85,7 @@ def images_fetch(
         name: An image of the catalogue, such as base, or a full reference.
         source: Gateway to ask first.
         gateway: Gateway that fetches it.
+        why: Why, for the audit.
         as_json: Print JSON.
         where: The fleet.
     """
@@ -98,7 +100,7 @@ def images_fetch(
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             target = gateway or await client.gateway()
-            found = await client.image_fetch(target, full, source)
+            found = await client.image_fetch(target, full, source, why=why)
         show(found, as_json=as_json, table=console.brought_text(found, target))
 
     asyncio.run(go())

@@ -176,7 +176,7 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     @property
     def paused(self) -> str:
         """Why no subtask is started, in words; empty when nothing hinders that, or it has ended."""
-        return "" if self.state.final else "; ".join(each.text for each in self.pauses)
+        return "" if self.state.final else "; ".join(dict.fromkeys(each.text for each in self.pauses))
 
     def of(self, subtask_id: str) -> SubtaskRecord:
         """Return the record of one subtask; KeyError when the plan has none of that id."""

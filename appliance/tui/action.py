@@ -39,6 +39,10 @@ class Parameter(Struct, frozen=True, kw_only=True):
         return f"[{word}]" if self.optional else word
 
 
+WHY = Parameter(kind="text", name="why", optional=True, rest=True)
+"""Why an order is given, for the audit and for those who wonder."""
+
+
 class Action(Struct, frozen=True, kw_only=True):
     """Something a person can do."""
 
@@ -83,7 +87,8 @@ class Action(Struct, frozen=True, kw_only=True):
     def sentence(self, given: Given) -> str:
         """Return what a confirmation says."""
         absent = {each.name: each.absent or f"any {each.name}" for each in self.takes}
-        return self.confirm.format_map(absent | dict(given))
+        why = f" Why: {given['why']}" if given.get("why") else ""
+        return f"{self.confirm.format_map(absent | dict(given))}{why}"
 
     def here(self, scope: str) -> bool:
         """Whether its keys work on a screen."""

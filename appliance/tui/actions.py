@@ -1,7 +1,7 @@
 """The registry of all actions of the terminal UI: it feeds keys, footer, help, `:` line and command palette."""
 
 from appliance.tui import orders
-from appliance.tui.action import Action, Parameter
+from appliance.tui.action import WHY, Action, Parameter
 from appliance.tui.logs.actions import LOGS
 from appliance.tui.replay.actions import REPLAY
 from appliance.tui.robots.actions import ROBOTS
@@ -63,7 +63,7 @@ ACTIONS: tuple[Action, ...] = (
         help="Have a gateway give its runs away and take no more",
         keys=("d",),
         screens=("fleet", "gateway"),
-        takes=(_GATEWAY,),
+        takes=(_GATEWAY, WHY),
         writes=True,
         dangerous=True,
         confirm="Drain {gateway}? Its runs are moved to other gateways, and it takes none until it is undrained.",
@@ -75,7 +75,7 @@ ACTIONS: tuple[Action, ...] = (
         help="Have a gateway take runs again",
         keys=("u",),
         screens=("fleet", "gateway"),
-        takes=(_GATEWAY,),
+        takes=(_GATEWAY, WHY),
         writes=True,
         do=orders.undrain,
     ),
@@ -85,7 +85,7 @@ ACTIONS: tuple[Action, ...] = (
         help="Have a gateway plan with another local model, which is tested before it takes over",
         keys=("m",),
         screens=("llm",),
-        takes=(_GATEWAY, Parameter(kind="text", name="folder")),
+        takes=(_GATEWAY, Parameter(kind="text", name="folder"), WHY),
         writes=True,
         dangerous=True,
         confirm="Have {gateway} plan with the model in {folder} from now on, until it is restarted?",
@@ -98,7 +98,7 @@ ACTIONS: tuple[Action, ...] = (
         help="Have containers of an image ready for ten minutes",
         keys=("w",),
         screens=("pool",),
-        takes=(_IMAGE, Parameter(kind="number", name="count", optional=True), _ANY_GATEWAY),
+        takes=(_IMAGE, Parameter(kind="number", name="count", optional=True), _ANY_GATEWAY, WHY),
         writes=True,
         do=orders.warm,
     ),
@@ -108,7 +108,7 @@ ACTIONS: tuple[Action, ...] = (
         help="Give up an idle container, or all idle ones of an image",
         keys=("e",),
         screens=("pool",),
-        takes=(Parameter(kind="container", name="container"), _ANY_GATEWAY),
+        takes=(Parameter(kind="container", name="container"), _ANY_GATEWAY, WHY),
         writes=True,
         dangerous=True,
         confirm="Give up {container}? The next run that needs such a container may have to wait for a cold start.",
@@ -120,7 +120,7 @@ ACTIONS: tuple[Action, ...] = (
         help="Start containers of an image again that is in quarantine",
         keys=("r",),
         screens=("pool",),
-        takes=(_IMAGE, _ANY_GATEWAY),
+        takes=(_IMAGE, _ANY_GATEWAY, WHY),
         writes=True,
         do=orders.release,
         footer=False,
@@ -129,7 +129,7 @@ ACTIONS: tuple[Action, ...] = (
         name="fetch",
         title="Fetch",
         help="Have a gateway bring an image to itself, by its full reference",
-        takes=(Parameter(kind="text", name="reference"), _GATEWAY),
+        takes=(Parameter(kind="text", name="reference"), _GATEWAY, WHY),
         writes=True,
         do=orders.fetch,
         footer=False,
@@ -143,6 +143,10 @@ ACTIONS: tuple[Action, ...] = (
            call="back", footer=False),
     Action(name="next", title="Next part", help="Go to the next table or text", keys=("tab",), call="next_part",
            footer=False),
+    Action(name="previous", title="Part before", help="Go to the table or text before", keys=("shift+tab",),
+           call="previous_part", footer=False),
+    Action(name="copy", title="Copy", help="Copy what is marked with the mouse; else say how to leave",
+           keys=("ctrl+c",), call="copy", footer=False),
     Action(name="write", title="Unlock", help="Allow what changes the fleet", keys=("W",), call="unlock",
            footer=False),
     Action(name="read", title="Lock", help="Read only: allow nothing that changes the fleet", keys=("R",),
@@ -154,7 +158,8 @@ ACTIONS: tuple[Action, ...] = (
     Action(name="palette", title="Palette", help="All of these by name", keys=("ctrl+p",), call="command_palette",
            footer=False),
     Action(name="help", title="Help", help="Keys, commands and signs", keys=("question_mark",), call="help"),
-    Action(name="quit", title="Quit", help="Leave; the fleet goes on", keys=("q",), call="quit", aliases=("q",)),
+    Action(name="quit", title="Quit", help="Leave; the fleet goes on", keys=("q", "ctrl+q"), call="quit",
+           aliases=("q",)),
 )  # fmt: skip
 BY_NAME: dict[str, Action] = {action.name: action for action in ACTIONS}
 

@@ -10,8 +10,10 @@ from textual.screen import Screen
 from appliance.errors import SwiftbotError
 from appliance.model import Approval, TaskRecord
 from appliance.tui import actions, themes
+from appliance.tui.action import key_name
 from appliance.tui.dialogs import ConfirmDialog
 from appliance.tui.help import HelpDialog
+from appliance.tui.keys import keys_of
 from appliance.tui.ordering import Ordering
 from appliance.tui.replay.source import ReplayView
 from appliance.tui.robots.takeover import TakeoverScreen
@@ -52,7 +54,8 @@ class SwiftbotApp(Ordering):
             if record.approval is Approval.ALWAYS:
                 self.push_screen(ReviewScreen(record.id))
 
-        self.push_screen(SubmitDialog(self.view, self.history, instruction=given.get("instruction", "")), submitted)
+        dialog = SubmitDialog(self.view, self.history, instruction=given.get("instruction", ""), own=self.config.keys)
+        self.push_screen(dialog, submitted)
 
     def do_review(self, given: Mapping[str, str]) -> None:
         """Look at the plan of a task that waits for approval."""
@@ -137,6 +140,19 @@ class SwiftbotApp(Ordering):
     def do_next_part(self, _given: Mapping[str, str]) -> None:
         """Go to the next part of the screen."""
         self.screen.focus_next()
+
+    def do_previous_part(self, _given: Mapping[str, str]) -> None:
+        """Go to the previous part of the screen."""
+        self.screen.focus_previous()
+
+    def do_copy(self, _given: Mapping[str, str]) -> None:
+        """Copy what is marked; without any text marked, whoever wanted to interrupt is told how to leave."""
+        marked = self.screen.get_selected_text()
+        if marked:
+            self.copy_to_clipboard(marked)
+            return
+        key = key_name(keys_of(actions.BY_NAME["quit"], self.config.keys)[0])
+        self.notify(f"{key} or :quit leaves", markup=False)
 
     def do_unlock(self, _given: Mapping[str, str]) -> None:
         """Allow what changes the fleet."""

@@ -6,11 +6,12 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding
-from textual.containers import Vertical, VerticalScroll
+from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Label, Static
 
 from appliance.tui.safe import safe
+from appliance.tui.widgets import Pane
 
 LONGEST_PIECE = 4000
 """Characters of one piece of text in a line that was laid out."""
@@ -56,18 +57,18 @@ class TextDialog(ModalScreen[None]):
 
     def compose(self) -> ComposeResult:
         """Make the dialog."""
-        with VerticalScroll(classes="dialog"):
+        with Pane(classes="dialog"):
             yield Label(Text(self._title), classes="title")
             yield Static(id="content")
             yield Static("Esc leaves", id="hint")
 
     def on_mount(self) -> None:
         """Let the arrow keys scroll."""
-        self.query_one(VerticalScroll).focus()
+        self.query_one(Pane).focus()
 
     def on_resize(self) -> None:
         """Lay the text out for the window."""
-        width = max(20, self.query_one(VerticalScroll).size.width - 3)
+        width = max(20, self.query_one(Pane).size.width - 3)
         self.query_one("#content", Static).update(harmless(self._content, width))
 
     def action_leave(self) -> None:

@@ -8,6 +8,8 @@ import time
 from collections.abc import Sequence
 from datetime import datetime
 
+from rich.cells import cell_len
+
 from appliance.model import Failure
 from appliance.tui.safe import safe
 
@@ -54,6 +56,22 @@ def sparkline(values: Sequence[float], width: int) -> str:
         least, most = min(shown), max(shown)
     span = (most - least) or 1.0
     return "".join(_BARS[min(len(_BARS) - 1, int((each - least) / span * len(_BARS)))] for each in shown)
+
+
+def hanging(text: str, margin: str, width: int) -> str:
+    """Return a text with a margin before each line that it takes in so many cells; as one line without a width.
+
+    Textual would begin the lines that follow at the left edge, where they look like something of their own.
+    """
+    if width <= cell_len(margin) + 20:
+        return f"{margin}{text}"
+    lines, line = list[str](), ""
+    for word in text.split(" "):
+        if line and cell_len(margin) + cell_len(line) + 1 + cell_len(word) > width:
+            lines, line = [*lines, line], word
+        else:
+            line = f"{line} {word}" if line else word
+    return "\n".join(f"{margin}{each}" for each in [*lines, line])
 
 
 def told(failure: Failure | None) -> str:

@@ -50,7 +50,7 @@ class Host(Protocol):
         ...
 
 
-class FleetScreen(Screen[None]):
+class FleetScreen(Screen[None], inherit_bindings=False):
     """A screen of the terminal UI. Subclasses say what they are and show, and make and draw their body."""
 
     scope: ClassVar[str] = ""
@@ -80,6 +80,8 @@ class FleetScreen(Screen[None]):
         """Whether its parts are there."""
         self._drawn: object = None
         self._said: object = None
+        self._counted: tuple[object, int, str] = (None, 0, "")
+        """Of which revisions tasks that go on, and what waits for people or is stopped, were counted."""
         self._texts: dict[str, Text] = {}
         """What parts of the body say, by selector."""
 
@@ -175,12 +177,12 @@ class FleetScreen(Screen[None]):
             self._draw_frame(store, force=force)
 
     def _draw_frame(self, store: Store, *, force: bool) -> None:
-        running = sum(not record.state.final for record in store.tasks.values())
+        running, pressing = self._count(store)
         present = sum(not gateway.lost_ns for gateway in store.gateways.values())
         host = self.host
         said = (
             store.connection, present, len(store.robots), running, host.unlocked, tuple(host.under_way),
-            self.size.width, self.title_of(), tuple(self.chosen()),
+            self.size.width, self.title_of(), tuple(self.chosen()), pressing,
         )  # fmt: skip
         if said == self._said and not force:
             return
@@ -188,19 +190,35 @@ class FleetScreen(Screen[None]):
         lost = len(store.gateways) - present
         counts = f"{present} gw{f' ({lost} lost)' if lost else ''} · {len(store.robots)} robots · {running} active"
         # Of fixed height: nothing has to be laid out anew for them.
-        self.query_one("#head", Static).update(self._head(counts), layout=False)
+        self.query_one("#head", Static).update(self._head(counts, pressing), layout=False)
         self.query_one("#foot", Static).update(self._foot(), layout=False)
         self._draw_banner(store)
 
-    def _head(self, counts: str) -> Text:
+    def _count(self, store: Store) -> tuple[int, str]:
+        """Return how many tasks go on, and in words what must not be overlooked on any screen."""
+        seen = (store, store.revisions(("tasks", "enquiries", "stops")), store.robots.arrangement)
+        if self._counted[0] != seen:
+            active = [record for record in store.tasks.values() if not record.state.final]
+            waiting = sum(record.proposal is not None and record.proposal.waits for record in active)
+            waiting += sum(each.open for each in store.enquiries.values())
+            parts = [f"◇ {waiting} wait{'s' if waiting == 1 else ''}"] if waiting else []
+            if store.stops.active:
+                held = sum(store.stops.of(name) is not None for name in store.robots)
+                parts.insert(0, "■ ALL STOPPED" if held == len(store.robots) else f"■ {held} stopped")
+            self._counted = (seen, len(active), " · ".join(parts))
+        return self._counted[1], self._counted[2]
+
+    def _head(self, counts: str, pressing: str) -> Text:
         host, width = self.host, max(20, self.size.width)
         mode = "[W] unlocked" if host.unlocked else "[R] read-only"
         if not host.view.steerable:
             mode = "[R] recorded"
         pending = "".join(f" · … {each}" for each in host.under_way)
-        first = Text.assemble(
-            (" SwiftBot ", "bold"), f"{safe(host.view.fleet, 40)} · {counts}{safe(pending, 60)}", no_wrap=True
-        )
+        # What presses takes the place of the name: at 80 columns there is no room for both.
+        name = f" {pressing} · " if pressing else " SwiftBot "
+        style = "bold yellow" if pressing else "bold"
+        rest = f"{safe(host.view.fleet, 40)} · {counts}{safe(pending, 60)}"
+        first = Text.assemble((name, style), rest, no_wrap=True)
         first.truncate(max(0, width - len(mode) - 2), overflow="ellipsis", pad=True)
         first.append(f" {mode} ", "bold yellow" if host.unlocked else "bold")
         first.truncate(width)

@@ -41,7 +41,7 @@ class Column(Struct, frozen=True, kw_only=True):
     """0: never left out."""
 
 
-class Grid(ScrollView, can_focus=True):
+class Grid(ScrollView, can_focus=True, inherit_bindings=False):
     """A table of rows by key.
 
     Args:

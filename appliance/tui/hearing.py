@@ -120,9 +120,10 @@ class Hearing:
         if notice is not None:
             self._store.take_notice(notice)
 
-    def _log(self, _key: str, line: LogLine | None) -> None:
+    def _log(self, key: str, line: LogLine | None) -> None:
         if line is not None:
-            self._store.take_log(line)
+            # Whose log it is the key says; a line's own source may be another gateway that it is about, or nobody.
+            self._store.take_log(structs.replace(line, source=key.split("/")[-2]))
 
     def _act(self, _key: str, act: Act | None) -> None:
         if act is not None:

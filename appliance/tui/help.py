@@ -7,7 +7,6 @@ from rich.table import Table
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding
-from textual.containers import VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Label, Static
 
@@ -15,6 +14,7 @@ from appliance.tui import signs
 from appliance.tui.action import Action, key_name
 from appliance.tui.actions import ACTIONS
 from appliance.tui.keys import keys_of
+from appliance.tui.widgets import Pane
 
 
 def help_text(scope: str, own: Mapping[str, str]) -> RenderableType:
@@ -59,14 +59,14 @@ class HelpDialog(ModalScreen[None]):
 
     def compose(self) -> ComposeResult:
         """Make the dialog out of the registry."""
-        with VerticalScroll(classes="dialog"):
+        with Pane(classes="dialog"):
             yield Label("Keys and commands", classes="title")
             yield Static(help_text(self._scope, self._own), id="keys")
             yield Static("Esc leaves", id="hint")
 
     def on_mount(self) -> None:
         """Let the arrow keys scroll."""
-        self.query_one(VerticalScroll).focus()
+        self.query_one(Pane).focus()
 
     def action_leave(self) -> None:
         """Close the help."""

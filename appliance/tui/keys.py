@@ -1,8 +1,10 @@
 """Key bindings made from the registry, and what a person's own settings make of them."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from textual.binding import Binding
+from textual.widgets import Input
 
 from appliance.errors import ConfigError
 from appliance.tui import actions
@@ -31,6 +33,31 @@ def bindings(scope: str = "") -> list[Binding]:
     ]
 
 
+DIALOG_KEYS: Mapping[str, str] = {"edit-first": "f2,ctrl+r"}
+"""Keys of dialogs that are no actions of the registry, by the name under which they can be changed."""
+
+
+def line_bindings() -> list[Binding]:
+    """Return the editing keys of a line that is written, each with a name such as `line-delete-left-word`.
+
+    They are Textual's own; the name is that of what they do there.
+    """
+    return [replace(each, id=_line_name(each)) for each in Input.BINDINGS if isinstance(each, Binding)]
+
+
+def _line_name(binding: Binding) -> str:
+    return "line-" + binding.action.replace("(True)", "-select").replace("_", "-")
+
+
+def names() -> dict[str, tuple[str, ...]]:
+    """Return all that can be given other keys: actions, keys of dialogs, editing keys; with their usual keys."""
+    found = {action.name: action.keys for action in actions.ACTIONS}
+    found |= {name: tuple(keys.split(",")) for name, keys in DIALOG_KEYS.items()}
+    for each in line_bindings():
+        found[str(each.id)] = (*found.get(str(each.id), ()), *each.key.split(","))
+    return found
+
+
 def keymap(own: Mapping[str, str]) -> dict[str, str]:
     """Return Textual's keymap for a person's own keys by action.
 
@@ -38,7 +65,7 @@ def keymap(own: Mapping[str, str]) -> dict[str, str]:
         ConfigError: no such action, no key, or two actions of one screen share a key.
     """
     for name, keys in own.items():
-        if name not in actions.BY_NAME:
+        if name not in names():
             raise ConfigError(f"tui.keys: there is no action {name!r}", remedy="`?` and docs/tui.md list them")
         if not all(part.strip() for part in keys.split(",")):
             raise ConfigError(f"tui.keys.{name}: {keys!r} names no key", remedy='write keys such as "ctrl+x,f9"')
@@ -49,11 +76,21 @@ def keymap(own: Mapping[str, str]) -> dict[str, str]:
                 other = taken.setdefault((scope, key), action.name)
                 if other != action.name:
                     raise ConfigError(f"tui.keys: {key} is both {other} and {action.name}", remedy="change one of them")
-    return {name: ",".join(part.strip() for part in keys.split(",")) for name, keys in own.items()}
+    lines: dict[str, str] = {}
+    for name, usual in names().items():
+        if name.startswith("line-"):
+            for key in _parts(own[name]) if name in own else usual:
+                if (other := lines.setdefault(key, name)) != name:
+                    raise ConfigError(f"tui.keys: {key} is both {other} and {name}", remedy="change one of them")
+    return {name: ",".join(_parts(keys)) for name, keys in own.items()}
 
 
 def keys_of(action: Action, own: Mapping[str, str]) -> tuple[str, ...]:
     """Return the keys of an action as a person has them."""
     if action.name in own:
-        return tuple(part.strip() for part in own[action.name].split(","))
+        return _parts(own[action.name])
     return action.keys
+
+
+def _parts(keys: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in keys.split(","))

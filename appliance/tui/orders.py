@@ -28,6 +28,10 @@ def number(given: Given, name: str, default: int, *, least: int, most: int) -> i
     return int(text)
 
 
+def _why(given: Given) -> str:
+    return given.get("why", "")
+
+
 # --- the audit ----------------------------------------------------------------------------------------------
 
 
@@ -50,19 +54,19 @@ async def acts(fleet: FleetClient, given: Given, _by: str) -> RenderableType:
 
 async def drain(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have a gateway give its runs away and take no more."""
-    state = await fleet.drain(given["gateway"], 0.0)
+    state = await fleet.drain(given["gateway"], 0.0, why=_why(given))
     return f"{state.gateway} drains: {len(state.left)} runs left"
 
 
 async def undrain(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have a gateway take runs again."""
-    state = await fleet.undrain(given["gateway"])
+    state = await fleet.undrain(given["gateway"], why=_why(given))
     return f"{state.gateway} takes runs again"
 
 
 async def swap(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have a gateway plan with another local model."""
-    swapped = await fleet.swap_model(given["gateway"], given["folder"])
+    swapped = await fleet.swap_model(given["gateway"], given["folder"], why=_why(given))
     return f"{given['gateway']} plans with {swapped.after} instead of {swapped.before}"
 
 
@@ -73,14 +77,15 @@ async def warm(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have containers of an image ready."""
     count = number(given, "count", 1, least=1, most=MOST_WARM)
     name = given.get("gateway") or await fleet.gateway()
-    found = await fleet.pool_warm(name, WarmAsk(image=given["image"], count=count, wait_s=WARM_WAIT_S))
+    ask = WarmAsk(image=given["image"], count=count, wait_s=WARM_WAIT_S, why=_why(given))
+    found = await fleet.pool_warm(name, ask)
     problem = f"; {found.problem}" if found.problem else ""
     return f"{name}: {found.ready} of {found.image} ready, {found.starting} starting{problem}"
 
 
 async def evict(fleet: FleetClient, given: Given, _by: str) -> str:
     """Give up a container, or all idle ones of an image."""
-    answers = await fleet.pool_evict(given["container"], given.get("gateway", ""))
+    answers = await fleet.pool_evict(given["container"], given.get("gateway", ""), why=_why(given))
     return "; ".join(_evicted(name, answers[name]) for name in sorted(answers))
 
 
@@ -92,12 +97,12 @@ def _evicted(gateway: str, answer: Evicted) -> str:
 
 async def release(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have an image started again that is in quarantine."""
-    found = await fleet.pool_release(given["image"], given.get("gateway", ""))
+    found = await fleet.pool_release(given["image"], given.get("gateway", ""), why=_why(given))
     return "; ".join(f"{each}: started again, it was left alone: {found[each].reason}" for each in sorted(found))
 
 
 async def fetch(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have a gateway bring an image to itself."""
-    brought = await fleet.image_fetch(given["gateway"], given["reference"])
+    brought = await fleet.image_fetch(given["gateway"], given["reference"], why=_why(given))
     whence = f" from {brought.gateway}" if brought.gateway else ": it was there already"
     return f"{brought.what} is on {given['gateway']}{whence}"

@@ -11,6 +11,7 @@ from textual.message import Message
 from textual.widgets import Input, Static
 
 from appliance.tui.safe import clip
+from appliance.tui.widgets import Field
 
 LONGEST = 2000
 """Characters of a line."""
@@ -52,7 +53,7 @@ class Lines:
         return self._lines[self._at] if self._at < len(self._lines) else self._draft
 
 
-class PromptInput(Input):
+class PromptInput(Field):
     """The field itself: Tab completes, the arrows bring back earlier lines, Esc leaves."""
 
     BINDINGS = [

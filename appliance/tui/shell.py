@@ -28,7 +28,7 @@ from appliance.tui.settings import TuiConfig
 _FONT = re.compile(r"@font-face \{[^}]*\}\s*")
 
 
-class Shell(App[None]):
+class Shell(App[None], inherit_bindings=False):
     """A window on a view of a fleet: what is seen of it, when it is drawn, and in which colours.
 
     Args:
@@ -41,7 +41,8 @@ class Shell(App[None]):
     BINDINGS = bindings()  # pyright: ignore[reportAssignmentType] - Textual wants a list of its own union
     MODES = SCREENS  # pyright: ignore[reportAssignmentType] - of classes, which make themselves
     DEFAULT_MODE = "fleet"
-    COMMAND_PALETTE_BINDING: ClassVar[str] = "ctrl+p"
+    ENABLE_COMMAND_PALETTE: ClassVar[bool] = False
+    """Textual would bind ^p to it for good; it is there all the same, under the keys of the action `palette`."""
     CSS = """
     ModalScreen { align: center middle; }
     .dialog { width: 90%; max-width: 110; height: 80%; border: round $accent; background: $surface; padding: 0 1; }
@@ -62,6 +63,7 @@ class Shell(App[None]):
         self._look = ""
         """The theme that styles were worked out for."""
         super().__init__()
+        self.use_command_palette = True
         self.view = view
         self.history = history or History(None)
         """Instructions submitted before."""

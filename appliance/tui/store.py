@@ -311,6 +311,8 @@ class Store:
         if event.kind is RunEventKind.STARTED and event.startup_ms is not None:
             self._started += 1
             self.starts.append(Start(event.phase, event.startup_ms))
+        if event.kind is RunEventKind.ALIVE:
+            return  # every two seconds of each run: they would push out what tells something
         parts = [f"{event.task}/{event.subtask}", str(event.kind)]
         if event.attempt > 1:
             parts.append(f"attempt {event.attempt}")

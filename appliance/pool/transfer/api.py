@@ -11,6 +11,7 @@ What takes long is answered with `pending` and asked for again. Chunks are raw b
 
 from msgspec import Struct
 
+from appliance.model import Signed
 from appliance.pool.transfer.manifest import Manifest
 
 
@@ -51,7 +52,7 @@ class ImageOffer(Struct, frozen=True, kw_only=True, omit_defaults=True):
     pending: bool = False
 
 
-class FetchAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FetchAsk(Signed, frozen=True, kw_only=True):
     """`image_fetch`: bring an image; `gateway` is asked first, empty: any that has it."""
 
     reference: str

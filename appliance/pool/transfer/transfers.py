@@ -97,8 +97,11 @@ class Transfers:
 
     # --- life -------------------------------------------------------------------------------------------------
 
-    async def start(self) -> None:
+    async def start(self, signed: Callable[[str, Any], Any] = lambda _, handler: handler) -> None:
         """Serve what others ask for, and look at what an earlier life of this gateway left in the spool.
+
+        Args:
+            signed: puts an audit around the handler of an operator's verb.
 
         Raises:
             RefusedError: the folders cannot be made.
@@ -110,7 +113,7 @@ class Transfers:
             raise RefusedError(f"transfers have no folder: {error}", remedy="make data_dir writable") from error
         self._giver.start()
         rpc = self._plane.rpc
-        rpc.register("image_fetch", FetchAsk, self._on_fetch)
+        rpc.register("image_fetch", FetchAsk, signed("image_fetch", self._on_fetch))
         rpc.register("transfers", TransfersAsk, self._on_list)
         rpc.register("transfer_cancel", CancelAsk, self._on_cancel)
         self._looking = asyncio.create_task(self._keep_looking(), name="look for images")

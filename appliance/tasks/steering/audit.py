@@ -21,7 +21,7 @@ log = structlog.get_logger(__name__)
 KEPT = 500
 """Orders that a gateway remembers for those who ask, its own and others'; the log on disk has all."""
 MAX_PROBLEM = 1000
-_TARGETS = ("id", "task", "robot", "robots", "container", "image", "folder")
+_TARGETS = ("id", "task", "robot", "robots", "container", "image", "folder", "reference")
 
 Q = TypeVar("Q", bound=Signed)
 R = TypeVar("R", bound=Struct)

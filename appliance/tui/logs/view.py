@@ -21,7 +21,7 @@ WIDEST = 600
 """Cells that a line may be scrolled sideways."""
 
 
-class LineView(ScrollView, Generic[T], can_focus=True):
+class LineView(ScrollView, Generic[T], can_focus=True, inherit_bindings=False):
     """A window on lines.
 
     Args:
@@ -38,6 +38,8 @@ class LineView(ScrollView, Generic[T], can_focus=True):
         Binding("pagedown", "page(1)", show=False),
         Binding("home,g", "first", show=False),
         Binding("end,G", "last", show=False),
+        Binding("left,h", "scroll_left", show=False),
+        Binding("right,l", "scroll_right", show=False),
     ]
     DEFAULT_CSS = """
     LineView { height: 1fr; scrollbar-size: 1 1; background: $background; color: $foreground; }
@@ -74,6 +76,11 @@ class LineView(ScrollView, Generic[T], can_focus=True):
         elif anchor is not None:
             self.scroll_to(y=self._index_of(anchor), animate=False, immediate=True)
         self.refresh()
+
+    def on_resize(self) -> None:
+        """Stay at the newest line: before the first layout there was no height to scroll by."""
+        if self.following:
+            self.scroll_end(animate=False, immediate=True, x_axis=False)
 
     def _index_of(self, number: int) -> int:
         """Return where the line of that number is, or the first after it."""

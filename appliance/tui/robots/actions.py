@@ -1,7 +1,7 @@
 """What can be done with robots: taking one over, answering what it asks, stopping them and letting them go."""
 
 from appliance.client import FleetClient
-from appliance.tui.action import Action, Given, Parameter
+from appliance.tui.action import WHY, Action, Given, Parameter
 from appliance.tui.safe import safe
 
 
@@ -12,9 +12,25 @@ async def answer(fleet: FleetClient, given: Given, _by: str) -> str:
 
 
 async def stop(fleet: FleetClient, given: Given, _by: str) -> str:
-    """Have robots hold and do nothing until they are let go: all, or one."""
-    robots = (given["robot"],) if given.get("robot") else ()
-    answer = await fleet.stop(robots)
+    """Have robots hold and do nothing until they are let go: all, or one.
+
+    A first word that is no robot's name begins the reason, and all robots are stopped: a name that is written wrongly
+    must not stop nobody.
+    """
+    robot, why = given.get("robot", ""), given.get("why", "")
+    if robot and not fleet.knows_robot(robot):
+        return await stop_these(fleet, (), f"{robot} {why}".strip())
+    return await stop_these(fleet, (robot,) if robot else (), why)
+
+
+async def stop_one(fleet: FleetClient, given: Given, _by: str) -> str:
+    """Have one robot hold."""
+    return await stop_these(fleet, (given["robot"],), given.get("why", ""))
+
+
+async def stop_these(fleet: FleetClient, robots: tuple[str, ...], why: str) -> str:
+    """Stop robots, or all when none is named; return who holds and who does not."""
+    answer = await fleet.stop(robots, why=why)
     held = f"holding: {', '.join(answer.robots)}" if answer.robots else "no robot has confirmed yet"
     problems = "".join(f"; NOT {name}: {why}" for name, why in sorted(answer.problems.items()))
     silent = f"; not confirmed by {', '.join(answer.silent)}" if answer.silent else ""
@@ -24,8 +40,9 @@ async def stop(fleet: FleetClient, given: Given, _by: str) -> str:
 async def resume_robots(fleet: FleetClient, given: Given, _by: str) -> str:
     """Lift the soft stops that the operator has seen: of all robots, or one."""
     robots = (given["robot"],) if given.get("robot") else ()
-    answer = await fleet.resume_robots(robots, stops=[each for each in given.get("stops", "").split("/") if each])
-    left = f"; still stopped: {len(answer.stops)}" if answer.stops else ""
+    stops = [each for each in given.get("stops", "").split("/") if each]
+    answer = await fleet.resume_robots(robots, stops=stops, why=given.get("why", ""))
+    left = f"; soft stops still in force for others: {len(answer.stops)}" if answer.stops else ""
     return f"{robots[0] if robots else 'all robots'} may move again{left}"
 
 
@@ -38,10 +55,7 @@ ROBOTS: tuple[Action, ...] = (
         help="Take a robot over and move it by hand while a key is held",
         keys=("o",),
         screens=("robots", "robot"),
-        takes=(
-            _ROBOT,
-            Parameter(kind="text", name="why", optional=True, rest=True),
-        ),
+        takes=(_ROBOT, WHY),
         writes=True,
         call="takeover",
     ),
@@ -71,7 +85,7 @@ ROBOTS: tuple[Action, ...] = (
         title="STOP all",
         help="Soft stop: all robots hold and do nothing until they are let go; no emergency stop. `:stop ROBOT`: one",
         keys=("f8",),
-        takes=(Parameter(kind="robot", name="robot", optional=True),),
+        takes=(Parameter(kind="robot", name="robot", optional=True), WHY),
         writes=True,
         always=True,
         do=stop,
@@ -82,10 +96,10 @@ ROBOTS: tuple[Action, ...] = (
         help="Soft stop of one robot",
         keys=("x",),
         screens=("robots", "robot"),
-        takes=(_ROBOT,),
+        takes=(_ROBOT, WHY),
         writes=True,
         always=True,
-        do=stop,
+        do=stop_one,
     ),
     Action(
         name="resume-robots",
@@ -93,10 +107,23 @@ ROBOTS: tuple[Action, ...] = (
         help="Lift the soft stop of a robot, or of all",
         keys=("z",),
         screens=("robots", "robot"),
-        takes=(Parameter(kind="robot", name="robot", optional=True, chosen=True, absent="all robots"),),
+        takes=(Parameter(kind="robot", name="robot", optional=True, chosen=True, absent="all robots"), WHY),
         writes=True,
         dangerous=True,
         confirm="Lift the soft stop of {robot}? It may move at once, as its task goes on. Is the way clear?",
+        sees_stops=True,
+        do=resume_robots,
+    ),
+    Action(
+        name="resume-all",
+        title="Let all go",
+        help="Lift the soft stops of all robots, wherever the cursor is",
+        keys=("Z",),
+        screens=("robots", "robot"),
+        takes=(WHY,),
+        writes=True,
+        dangerous=True,
+        confirm="Lift the soft stops of all robots? They may move at once, as their tasks go on. Is the way clear?",
         sees_stops=True,
         do=resume_robots,
     ),

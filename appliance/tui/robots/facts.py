@@ -83,8 +83,14 @@ def state_cell(robot: Robot) -> tuple[str, str]:
         return f"■ {safe(robot.stopped, 80)}", "bold red"
     if robot.questions:
         return f"? asks: {safe(robot.questions[0].question, 80)}", "bold yellow"
+    if info.failsafe:
+        return f"✘ failsafe: {safe(info.failsafe, 80)}", "bold red"
     if robot.lease is not None:
         return f"⇅ {safe(robot.lease.text, 80)}", "magenta"
+    if info.seized:
+        return f"▲ taken: {safe(info.seized, 80)}", "yellow"
+    if info.warnings or info.estimator:
+        return f"▲ {safe(', '.join((*info.warnings, *info.estimator)), 80)}", "yellow"
     words = " ".join(part for part in (f"holds {info.holding}" if info.holding else "", info.note) if part)
     return f"✔ {safe(words, 80) or 'online'}", "green"
 
@@ -103,12 +109,11 @@ def place(pose: Pose | None) -> str:
 
 
 def robot_cells(robot: Robot) -> tuple[Cell, ...]:
-    """Return a robot's row: name, kind, link, mode, battery, position, mission, state."""
+    """Return a robot's row: name, kind with link, mode, battery, position, mission, state."""
     info = robot.info
     return (
         (safe(info.id, 63), "bold"),
-        safe(info.kind, 20),
-        safe(link(info), 63),
+        f"{safe(info.kind, 20)} {safe(link(info), 63)}",
         safe(f"{info.mode}{' armed' if info.armed else ''}".strip() or "–", 40),
         battery_cell(info),
         place(info.pose),
@@ -120,7 +125,35 @@ def robot_cells(robot: Robot) -> tuple[Cell, ...]:
 def searched(name: str, robot: Robot) -> str:
     """Return what a filter looks at."""
     info = robot.info
-    return f"{name} {info.kind} {info.gateway} {info.mode} {info.note} {robot.mission} {state_cell(robot)[0]}"
+    return f"{name} {info.kind} {link(info)} {info.mode} {info.note} {robot.mission} {state_cell(robot)[0]}"
+
+
+def troubles(robot: Robot) -> list[str]:
+    """Return what keeps a robot from working, in sentences with what helps."""
+    info, found = robot.info, list[str]()
+    if not info.online:
+        whom = f"{safe(info.gateway, 63)}'s link to it" if info.gateway else "its own session"
+        found.append(f"nothing is heard of it → see that it is on, and {whom} (`swiftbot robots links list`)")
+    if robot.stopped:
+        found.append("nothing moves it until it is let go → z or `:resume-robots`, when the way is clear")
+    if info.failsafe:
+        found.append(f"failsafe: {safe(info.failsafe, 200)} → commands are taken again when the vehicle ends it")
+    if info.seized:
+        found.append(f"not commanded: {safe(info.seized, 200)} → it is again when its pilot gives it back")
+    if info.warnings:
+        found.append(safe(", ".join(info.warnings), 200))
+    if info.estimator:
+        found.append(f"its position estimator does not know {safe(', '.join(info.estimator), 200)}")
+    return found
+
+
+def selected_text(robot: Robot) -> Text:
+    """Return of the robot under the cursor what its row has no room for: its whole state and its mission."""
+    state, style = state_cell(robot)
+    mission = f" · {safe(robot.mission, 120)}" if robot.mission else " · no mission"
+    if robot.questions and state.startswith("?"):
+        mission = f" → A answers{mission}"
+    return Text.assemble((safe(robot.info.id, 63), "bold"), " ", (state, style), mission)
 
 
 def about(robot: Robot) -> Text:
@@ -142,9 +175,13 @@ def about(robot: Robot) -> Text:
         ("answers", safe(", ".join(info.verbs) or "not told", 300), ""),
     ]
     out = Text()
-    for name, value, how in facts:
+    for number, (name, value, how) in enumerate(facts):
         out.append(f"{name:<9}", "bold").append(f"{value}\n", how)
-    if info.note and info.online:
+        for each in () if number else troubles(robot):
+            out.append(f"▲ {each}\n", "yellow")
+    if info.mission_items:
+        out.append(f"· item {info.mission_item} of {info.mission_items} of the mission on board\n", "dim")
+    if info.note and info.online and not info.seized:
         out.append(f"… {safe(info.note, 300)}\n", "yellow")
     for each in robot.questions:
         choices = f" ({safe(' / '.join(each.choices), 120)})" if each.choices else ""

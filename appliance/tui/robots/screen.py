@@ -3,28 +3,29 @@
 from rich.text import Text
 from textual import on
 from textual.app import ComposeResult
-from textual.containers import Container, VerticalScroll
+from textual.containers import Container, Vertical
 from textual.widgets import Static
 
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
-from appliance.tui.robots.facts import Robot, about, robot_cells, searched
+from appliance.tui.robots.facts import Robot, about, robot_cells, searched, selected_text
 from appliance.tui.robots.ground import Ground
 from appliance.tui.robots.known import KnownRobots
 from appliance.tui.safe import safe
 from appliance.tui.store import Store
+from appliance.tui.widgets import Pane
 
 ROBOTS = (
-    Column(title="robot", width=10, grow=True),
-    Column(title="kind", width=7, drop=1),
-    Column(title="link", width=7, drop=2),
-    Column(title="mode", width=13),
-    Column(title="batt", width=5, right=True),
-    Column(title="x y z", width=15, right=True),
-    Column(title="mission", width=14, grow=True, drop=3),
-    Column(title="state", width=12, grow=True),
+    Column(title="robot", width=8, grow=True),
+    Column(title="kind, link", width=12),
+    Column(title="mode", width=12),
+    Column(title="batt", width=4, right=True),
+    Column(title="x y z", width=13, right=True),
+    Column(title="mission", width=11, grow=True),
+    Column(title="state", width=11, grow=True),
 )
+"""All that is to be told of a robot stands at 80 columns, beside a scroll bar."""
 _WIDE = 150
 """Columns from which the map stands beside the table."""
 
@@ -38,9 +39,10 @@ class RobotsScreen(FleetScreen):
     DEFAULT_CSS = """
     RobotsScreen #parts { layout: vertical; height: 1fr; }
     RobotsScreen #parts.wide { layout: horizontal; }
-    RobotsScreen #robots { height: 1fr; }
+    RobotsScreen #list { height: 1fr; }
+    RobotsScreen #selected { height: auto; max-height: 3; padding: 0 1; }
     RobotsScreen #ground { height: 1fr; border-top: solid $panel; }
-    RobotsScreen #parts.wide #robots { width: 3fr; height: 100%; }
+    RobotsScreen #parts.wide #list { width: 3fr; height: 100%; }
     RobotsScreen #parts.wide #ground { width: 2fr; height: 100%; border-top: none; border-left: solid $panel; }
     """
 
@@ -51,7 +53,9 @@ class RobotsScreen(FleetScreen):
     def body(self) -> ComposeResult:
         """Make the parts."""
         with Container(id="parts"):
-            yield Grid(ROBOTS, robot_cells, id="robots", empty="no robots are known")
+            with Vertical(id="list"):
+                yield Grid(ROBOTS, robot_cells, id="robots", empty="no robots are known")
+                yield Static(id="selected")
             yield Ground(id="ground")
 
     def on_resize(self) -> None:
@@ -66,10 +70,16 @@ class RobotsScreen(FleetScreen):
         grid = self.query_one("#robots", Grid)
         grid.show(shown, empty="no robot matches the filter" if rows else "no robots are known")
         self.query_one(Ground).show(shown.values(), selected=grid.selected or "", view=self.view)
+        self._tell()
 
     @on(Grid.Moved)
     def _mark(self, event: Grid.Moved) -> None:
         self.query_one(Ground).mark(event.key)
+        self._tell()
+
+    def _tell(self) -> None:
+        robot: Robot | None = self.query_one("#robots", Grid).thing
+        self.say("#selected", selected_text(robot) if robot is not None else Text())
 
     @on(Grid.Picked)
     def _open(self, event: Grid.Picked) -> None:
@@ -119,7 +129,7 @@ class RobotScreen(FleetScreen):
 
     def body(self) -> ComposeResult:
         """Make the parts."""
-        with VerticalScroll(id="about-box"):
+        with Pane(id="about-box"):
             yield Static(id="about")
         yield Ground(id="ground")
 

@@ -1,54 +1,37 @@
 """The screen of the fleet: its gateways, what is wrong with them in whole sentences, and the recorders."""
 
-from collections.abc import Iterable
-
 from rich.text import Text
 from textual import on
 from textual.app import ComposeResult
 from textual.widgets import Static
 
-from appliance.record.facts import RecorderStatus
-from appliance.tui.drawing import Cell, age, bar, clock
+from appliance.tui.drawing import Cell, age, bar
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
 from appliance.tui.safe import safe
+from appliance.tui.screens.condition import gateway_notes, gateway_state, recorder_notes
 from appliance.tui.screens.gateway import GatewayScreen
-from appliance.tui.store import SILENT, Gateway, Store
+from appliance.tui.store import Gateway, Store
 
 GATEWAYS = (
-    Column(title="gateway", width=14, grow=True),
+    Column(title="gateway", width=9, grow=True),
     Column(title="state", width=12),
     Column(title="load", width=4, right=True),
     Column(title="cpu", width=4, right=True),
-    Column(title="mem", width=6, right=True),
+    Column(title="mem", width=5, right=True),
     Column(title="pool", width=5, right=True),
     Column(title="runs", width=5, right=True),
     Column(title="tasks", width=5, right=True),
-    Column(title="link", width=7, right=True, drop=1),
-    Column(title="arc", width=4, right=True, drop=2),
-    Column(title="up", width=5, right=True, drop=3),
-    Column(title="version", width=8, drop=4),
-    Column(title="busy", width=16, drop=5),
-    Column(title="robots", width=16, grow=True, drop=6),
+    Column(title="link", width=7, right=True),
+    Column(title="arc", width=4, right=True),
+    Column(title="version", width=7),
+    Column(title="up", width=5, right=True, drop=1),
+    Column(title="busy", width=16, drop=2),
+    Column(title="robots", width=16, grow=True, drop=3),
 )
+"""All that is to be told of a gateway stands at 80 columns, beside a scroll bar."""
 _MOST_NOTES = 6
-
-
-def gateway_state(gateway: Gateway) -> tuple[str, str]:
-    """Return a gateway's state in few words, with its sign and style; `notes` has the whole story."""
-    status = gateway.status
-    if gateway.lost_ns:
-        return f"✘ {clock(gateway.lost_ns)}", "red"
-    if status.draining:
-        return "◌ draining", "magenta"
-    if status.pool_problem:
-        return "✘ pool", "red"
-    if status.overloaded:
-        return "▲ overload", "yellow"
-    if not status.limits_enforced:
-        return "▲ no limits", "yellow"
-    return "✔ up", "green"
 
 
 def gateway_cells(gateway: Gateway, now_ns: int = 0) -> tuple[Cell, ...]:
@@ -66,8 +49,8 @@ def gateway_cells(gateway: Gateway, now_ns: int = 0) -> tuple[Cell, ...]:
         (str(each.tasks), dim),
         ("" if gateway.latency_ms is None else f"{gateway.latency_ms:.1f}ms", dim),
         ("" if gateway.arc is None else f"{gateway.arc:.0%}", dim),
-        (age(each.started_ns, now_ns), dim),
         (safe(each.version, 12), dim),
+        (age(each.started_ns, now_ns), dim),
         (bar(each.load, 10), dim or _hot(each.load)),
         (safe(", ".join(each.robots), 80), dim),
     )
@@ -75,48 +58,6 @@ def gateway_cells(gateway: Gateway, now_ns: int = 0) -> tuple[Cell, ...]:
 
 def _hot(load: float) -> str:
     return "red" if load >= 0.9 else "yellow" if load >= 0.7 else ""
-
-
-def gateway_notes(gateways: Iterable[Gateway]) -> list[Text]:
-    """Return what is wrong with gateways in whole sentences, the worst first."""
-    found: list[tuple[int, Text]] = []
-    for gateway in gateways:
-        each = gateway.status
-        name = safe(each.id, 63)
-        if gateway.lost_ns:
-            found.append((0, Text(f"✘ {name}: not reachable since {clock(gateway.lost_ns)}", "red")))
-            continue
-        if each.pool_problem:
-            found.append((1, Text(f"✘ {name}: {safe(each.pool_problem)}", "red")))
-        if each.overloaded:
-            found.append((2, Text(f"▲ {name}: {safe(each.overloaded)}", "yellow")))
-        if each.drain:
-            found.append((2, Text(f"◌ {name}: {safe(each.drain)}", "magenta")))
-        if not each.limits_enforced:
-            told = "container CPU and memory limits are not enforced (the kernel delegates no cgroups)"
-            found.append((3, Text(f"▲ {name}: {told}", "yellow")))
-        refused = sum(each.refused.values())
-        if refused:
-            kinds = ", ".join(f"{safe(kind, 40)} {count}" for kind, count in sorted(each.refused.items()))
-            found.append((4, Text(f"· {name}: {refused} bad inputs refused ({kinds})", "dim")))
-    return [text for _, text in sorted(found, key=lambda each: each[0])]
-
-
-def recorder_notes(recorders: Iterable[RecorderStatus]) -> list[Text]:
-    """Return how the recorders are, a line each."""
-    lines: list[Text] = []
-    for each in recorders:
-        name = safe(each.id, 63)
-        dropped = sum(each.dropped.values())
-        lost = f", {dropped} lost ({safe(', '.join(sorted(each.dropped)))})" if dropped else ""
-        if each.problem:
-            lines.append(Text(f"✘ recorder {name}: {safe(each.problem)}{lost}", "red"))
-        elif each.state == SILENT:
-            lines.append(Text(f"▲ recorder {name}: not heard any more; is `swiftbot record` running?", "yellow"))
-        else:
-            style = "yellow" if dropped else "dim"
-            lines.append(Text(f"✔ recorder {name}: {each.messages} messages in {safe(each.file, 200)}{lost}", style))
-    return lines
 
 
 class FleetOverview(FleetScreen):

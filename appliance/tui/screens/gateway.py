@@ -6,11 +6,12 @@ from textual.widgets import Static
 
 from appliance.model import SubtaskState
 from appliance.tui import signs
-from appliance.tui.drawing import age, clock, milliseconds
+from appliance.tui.drawing import Cell, age, clock, milliseconds
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
 from appliance.tui.safe import safe
+from appliance.tui.screens.condition import gateway_state, notes_of
 from appliance.tui.screens.pool import container_cells
 from appliance.tui.store import Gateway, Store
 
@@ -29,18 +30,11 @@ _LOG_LINES = 8
 def about(gateway: Gateway, store: Store) -> Text:
     """Return what is known of a gateway, in lines of labelled facts."""
     each = gateway.status
-    state = (
-        f"✘ not reachable since {clock(gateway.lost_ns)}"
-        if gateway.lost_ns
-        else f"◌ drains: {safe(each.drain)}"
-        if each.draining
-        else "✔ up"
-    )
     latency = "not measured" if gateway.latency_ms is None else f"{gateway.latency_ms:.1f} ms from here"
     arc = "not known" if gateway.arc is None else f"{gateway.arc:.1%} of the keys"
     robots = [name for name in sorted(store.robots) if store.robots[name].gateway == each.id]
-    facts = [
-        ("state", state),
+    facts: list[tuple[str, Cell]] = [
+        ("state", gateway_state(gateway)),
         ("version", f"{safe(each.version, 20)}, process {each.pid}, up {age(each.started_ns)}"),
         ("machine", f"{each.cores} cores, cpu {each.cpu_percent:.0f}%, the daemon has {each.memory_mb:.0f} MB"),
         (
@@ -55,12 +49,8 @@ def about(gateway: Gateway, store: Store) -> Text:
         ("models", safe(", ".join(each.models) or "not told", 200)),
         ("robots", safe(", ".join(robots) or "none", 200)),
     ]
-    problems = [safe(text) for text in (each.pool_problem, each.overloaded) if text]
     lines = [Text.assemble((f"{name:<8}", "bold"), value) for name, value in facts]
-    lines += [Text(f"▲ {problem}", "yellow") for problem in problems]
-    if refused := sum(each.refused.values()):
-        kinds = ", ".join(f"{safe(kind, 40)} {count}" for kind, count in sorted(each.refused.items()))
-        lines.append(Text(f"· {refused} bad inputs refused ({kinds})", "dim"))
+    lines += [note.line() for note in notes_of(gateway)]
     return Text("\n").join(lines)
 
 

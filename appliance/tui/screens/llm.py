@@ -91,7 +91,8 @@ def about(gateway: Gateway) -> Text:
             )
         )
         if slot.problem:
-            lines.append(Text(f"  ✘ {safe(slot.problem)}", "red"))
+            remedy = "m has it plan with another model; the other tiers answer meanwhile"
+            lines.append(Text(f"  ✘ {safe(slot.problem)} → {remedy}", "red"))
     cache = planner.cache
     looked = cache.hits + cache.misses
     lines.append(

@@ -21,18 +21,19 @@ from appliance.tui.grammar import plain_image
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
 from appliance.tui.safe import safe
+from appliance.tui.screens.condition import gateway_notes
 from appliance.tui.store import Start, Store
 
 CONTAINERS = (
     Column(title="image", width=10, grow=True),
-    Column(title="container", width=10),
+    Column(title="container", width=10, grow=True),
     Column(title="gateway", width=8, grow=True),
     Column(title="state", width=10),
     Column(title="age", width=5, right=True),
-    Column(title="hits", width=5, right=True),
-    Column(title="cold", width=8, right=True, drop=2),
-    Column(title="cpu/mem", width=9, right=True, drop=3),
-    Column(title="running now", width=18, grow=True),
+    Column(title="hits", width=4, right=True),
+    Column(title="cpu/mem", width=9, right=True),
+    Column(title="running now", width=14, grow=True),
+    Column(title="cold", width=8, right=True, drop=1),
 )
 
 
@@ -60,9 +61,9 @@ def pool_cells(each: ContainerInfo) -> tuple[Cell, ...]:
         (sign.text, sign.style),
         age(each.since_ns),
         str(each.runs),
-        milliseconds(each.cold_ms),
         f"{each.cpu:g}/{each.memory_mb}M",
         safe(each.run, 80),
+        milliseconds(each.cold_ms),
     )
 
 
@@ -113,16 +114,18 @@ class PoolScreen(FleetScreen):
     """Containers of all gateways, how starts went, and what pools decided."""
 
     scope = "pool"
-    shows = ("containers", "starts", "asked")
+    shows = ("containers", "starts", "asked", "gateways")
     BINDINGS = bindings("pool")
     DEFAULT_CSS = """
     PoolScreen #starts { height: auto; padding: 0 1; border-top: solid $panel; }
+    PoolScreen #problems { height: auto; max-height: 4; padding: 0 1; }
     PoolScreen #decisions { height: auto; max-height: 40%; padding: 0 1; }
     """
 
     def body(self) -> ComposeResult:
         """Make the parts."""
         yield Grid(CONTAINERS, pool_cells, id="containers", empty="no warm containers")
+        yield Static(id="problems")
         yield Static(id="starts")
         yield Static(id="decisions")
 
@@ -156,6 +159,8 @@ class PoolScreen(FleetScreen):
         shown = self.filtered(rows, lambda key, each: f"{key} {each.image} {each.state} {each.run}")
         empty = "no container matches the filter" if rows else "no warm containers"
         self.query_one("#containers", Grid).show(shown, empty=empty)
+        wrong = gateway_notes((held for held in store.gateways.values() if not held.lost_ns), about="pool")
+        self.say("#problems", Text("\n").join(wrong))
         self.say("#starts", starts_text(tuple(store.starts), self.size.width))
         known = store.asked.get(DECISIONS)
         decisions = cast("tuple[Decision, ...]", known) if isinstance(known, tuple) else ()

@@ -1,12 +1,11 @@
 """What can be done with tasks and their subtasks, and with plans under review."""
 
-from appliance.tui.action import Action, Parameter
+from appliance.tui.action import WHY, Action, Parameter
 from appliance.tui.tasks import orders
 
 _TASK = Parameter(kind="task", name="task")
 _SUBTASK = Parameter(kind="subtask", name="subtask")
 _STEP = Parameter(kind="step", name="step")
-_WHY = Parameter(kind="text", name="why", optional=True, rest=True)
 
 TASKS: tuple[Action, ...] = (
     Action(
@@ -15,7 +14,7 @@ TASKS: tuple[Action, ...] = (
         help="Cancel a task",
         keys=("c",),
         screens=("tasks", "task"),
-        takes=(_TASK,),
+        takes=(_TASK, WHY),
         writes=True,
         dangerous=True,
         confirm="Cancel task {task}? Its runs are ended where they are, and what has not begun never will.",
@@ -37,7 +36,7 @@ TASKS: tuple[Action, ...] = (
         help="Move a running subtask to another gateway, with its checkpoint",
         keys=("m",),
         screens=("tasks", "task"),
-        takes=(_SUBTASK, Parameter(kind="gateway", name="gateway", optional=True)),
+        takes=(_SUBTASK, Parameter(kind="gateway", name="gateway", optional=True), WHY),
         writes=True,
         do=orders.migrate,
     ),
@@ -56,7 +55,7 @@ TASKS: tuple[Action, ...] = (
         help="Start no further subtask of a task; what runs goes on",
         keys=("p",),
         screens=("tasks", "task"),
-        takes=(_TASK, _WHY),
+        takes=(_TASK, WHY),
         writes=True,
         do=orders.pause,
     ),
@@ -65,7 +64,7 @@ TASKS: tuple[Action, ...] = (
         title="Hold",
         help="Pause a task and end runs that can go on from a checkpoint later",
         screens=("tasks", "task"),
-        takes=(_TASK, _WHY),
+        takes=(_TASK, WHY),
         writes=True,
         dangerous=True,
         confirm="Hold task {task}? Nothing more of it is started, and runs that keep checkpoints are ended.",
@@ -78,7 +77,7 @@ TASKS: tuple[Action, ...] = (
         help="Let a paused task go on",
         keys=("r",),
         screens=("tasks", "task"),
-        takes=(_TASK, _WHY),
+        takes=(_TASK, WHY),
         writes=True,
         dangerous=True,
         confirm="Resume task {task}? What waits in it is started, and its robots may move.",
@@ -90,7 +89,7 @@ TASKS: tuple[Action, ...] = (
         help="Try again what failed or was cancelled in a task; what succeeded is kept",
         keys=("t",),
         screens=("tasks", "task"),
-        takes=(_TASK, _WHY),
+        takes=(_TASK, WHY),
         writes=True,
         dangerous=True,
         confirm="Try task {task} again? What failed or was cancelled runs once more; what succeeded is kept.",
@@ -101,7 +100,7 @@ TASKS: tuple[Action, ...] = (
         title="Retry one",
         help="Try one subtask again",
         screens=("task",),
-        takes=(_SUBTASK, _WHY),
+        takes=(_SUBTASK, WHY),
         writes=True,
         dangerous=True,
         confirm="Try {subtask} again? It runs once more.",
@@ -115,7 +114,7 @@ TASKS: tuple[Action, ...] = (
         help="Let the plan run as it stands here",
         keys=("a",),
         screens=("review",),
-        takes=(_WHY,),
+        takes=(WHY,),
         writes=True,
         call="here approve",
     ),
@@ -125,7 +124,7 @@ TASKS: tuple[Action, ...] = (
         help="Turn the plan down",
         keys=("x",),
         screens=("review",),
-        takes=(_WHY,),
+        takes=(WHY,),
         writes=True,
         call="here reject",
     ),

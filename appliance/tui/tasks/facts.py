@@ -16,7 +16,7 @@ from appliance.model import (
     TaskState,
 )
 from appliance.tui import signs
-from appliance.tui.drawing import Cell, bar, duration, milliseconds, told
+from appliance.tui.drawing import Cell, bar, duration, hanging, milliseconds, told
 from appliance.tui.logs.lines import clock
 from appliance.tui.plans import shape
 from appliance.tui.plans.editing import params_text
@@ -58,7 +58,7 @@ def progress(record: TaskRecord) -> float:
 
 
 def task_cells(record: TaskRecord) -> tuple[Cell, ...]:
-    """Return a task's row: id, state, done, when it was accepted, by whom, what was asked."""
+    """Return a task's row: id, state, done, how far, when accepted, by whom, what was asked, what it waits for."""
     what = safe(record.instruction, 300)
     if record.priority != PLAIN_PRIORITY:
         what = f"p{record.priority} {what}"
@@ -66,9 +66,11 @@ def task_cells(record: TaskRecord) -> tuple[Cell, ...]:
         (safe(record.id, 64), "bold"),
         state_cell(record),
         done(record),
+        f"{progress(record):.0%}" if record.subtasks else "",
         clock(record.created_ns)[:8],
         safe(record.submitter, 20),
         what,
+        (reason(record), "yellow"),
     )
 
 
@@ -80,19 +82,42 @@ def reason(record: TaskRecord) -> str:
         return safe(record.paused)
     proposal = waits(record)
     if proposal is not None:
-        left = proposal.since_s + proposal.expires_s - record.elapsed_s
-        expires = f"; expires in {duration(left)}" if proposal.expires_s else ""
+        expires = f"; expires {_expiry(proposal, record)}" if proposal.expires_s else ""
         return f"waits for approval: {safe(proposal.note, 200) or 'an operator is to look at its plan'}{expires}"
     if record.state is TaskState.ACCEPTED:
         return "being planned"
+    if record.state is TaskState.CANCELLING:
+        word = record.cancelled_by
+        return f"its runs are being ended{f', as {safe(word.by, 40)} asked' if word is not None and word.by else ''}"
     if any(each.state is SubtaskState.RUNNING for each in record.subtasks):
         return ""
     notes = [f"{each.subtask.id}: {each.note}" for each in record.subtasks if each.note and not each.state.final]
-    return safe("; ".join(notes[:3]) or record.note)
+    return safe("; ".join(notes[:3]) or record.note or _between(record))
 
 
-def task_text(record: TaskRecord) -> Text:
-    """Draw a task: what was asked, why it waits, its plan as a graph, and what became of each subtask."""
+def _between(record: TaskRecord) -> str:
+    """Return what a task without a word of its own is about to do, by the states of its subtasks."""
+    sent = [each for each in record.subtasks if each.state is SubtaskState.DISPATCHED]
+    if sent:
+        return f"{sent[0].subtask.id}: starts on {sent[0].gateway or 'a gateway'}"
+    ready = [each.subtask.id for each in record.subtasks if each.state is SubtaskState.READY]
+    return f"{ready[0]}: a gateway for it is chosen" if ready else ""
+
+
+def _expiry(proposal: Proposal, record: TaskRecord) -> str:
+    """Return when a plan that waits expires: the time of day, which stays true however long nothing is heard."""
+    if proposal.at_ns > 0:
+        return f"at {clock(proposal.at_ns + int(proposal.expires_s * 1e9))[:8]}"
+    return f"in {duration(proposal.since_s + proposal.expires_s - record.elapsed_s)}"
+
+
+def task_text(record: TaskRecord, width: int = 0) -> Text:
+    """Draw a task: what was asked, why it waits, its plan as a graph, and what became of each subtask.
+
+    Args:
+        record: the task.
+        width: cells of a line, for what takes several; 0: not known.
+    """
     out = Text.assemble((safe(record.id, 80), "bold"), " ", state_cell(record))
     if record.coordinator:
         out.append(f" · coordinated by {safe(record.coordinator, 63)}")
@@ -112,7 +137,7 @@ def task_text(record: TaskRecord) -> Text:
         out.append_text(plan_lines(proposal.plan.subtasks))
         return out
     for node in nodes(record).values():
-        out.append_text(subtask_lines(node.record, node.depth))
+        out.append_text(subtask_lines(node.record, node.depth, width))
     return out
 
 
@@ -145,7 +170,7 @@ class Node(Struct, frozen=True):
 # --- subtasks ----------------------------------------------------------------------------------------------------
 
 
-def subtask_lines(record: SubtaskRecord, depth: int) -> Text:
+def subtask_lines(record: SubtaskRecord, depth: int, width: int = 0) -> Text:
     """Draw one subtask: what it is and how it stands, where and how long, and why it failed."""
     sign = signs.subtask(record.state)
     subtask = record.subtask
@@ -162,9 +187,9 @@ def subtask_lines(record: SubtaskRecord, depth: int) -> Text:
     margin = " " * (len(shape.branch(depth)) + 2)
     facts = _facts(record)
     if facts:
-        out.append(f"{margin}{' · '.join(facts)}\n", "dim")
+        out.append(f"{hanging(' · '.join(facts), margin, width)}\n", "dim")
     if record.failure is not None and record.state is not SubtaskState.SUCCEEDED:
-        out.append(f"{margin}✘ {told(record.failure)}\n", "red")
+        out.append(f"{hanging(f'✘ {told(record.failure)}', margin, width)}\n", "red")
     return out
 
 

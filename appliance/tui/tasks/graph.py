@@ -7,7 +7,6 @@ from collections import deque
 from rich.text import Text
 from textual import on, work
 from textual.app import ComposeResult
-from textual.containers import VerticalScroll
 from textual.widgets import Static
 
 from appliance.errors import SwiftbotError
@@ -24,6 +23,7 @@ from appliance.tui.safe import safe
 from appliance.tui.store import Store
 from appliance.tui.tasks import reasons
 from appliance.tui.tasks.facts import Node, brief, nodes, reason, state_cell, subtask_cells, waits
+from appliance.tui.widgets import Pane
 
 SUBTASKS = (
     Column(title="subtask", width=9, grow=True),
@@ -87,7 +87,7 @@ class TaskScreen(FleetScreen):
         """Make the parts."""
         yield Static(id="about")
         yield Grid(SUBTASKS, subtask_cells, id="subtasks", empty="no plan yet")
-        with VerticalScroll(id="detail-box"):
+        with Pane(id="detail-box"):
             yield Static(id="detail")
 
     def on_mount(self) -> None:

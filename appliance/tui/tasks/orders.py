@@ -24,7 +24,7 @@ def split_subtask(text: str) -> tuple[str, str]:
 
 async def cancel(fleet: FleetClient, given: Given, _by: str) -> TaskRecord:
     """Stop a task."""
-    return await fleet.cancel(given["task"])
+    return await fleet.cancel(given["task"], why=given.get("why", ""))
 
 
 async def why(fleet: FleetClient, given: Given, _by: str) -> RenderableType:
@@ -36,7 +36,8 @@ async def why(fleet: FleetClient, given: Given, _by: str) -> RenderableType:
 async def migrate(fleet: FleetClient, given: Given, _by: str) -> str:
     """Move a subtask's run to another gateway."""
     task, subtask = split_subtask(given["subtask"])
-    moved = await fleet.migrate(MigrateAsk(task=task, subtask=subtask, to=given.get("gateway", "")))
+    ask = MigrateAsk(task=task, subtask=subtask, to=given.get("gateway", ""), why=given.get("why", ""))
+    moved = await fleet.migrate(ask)
     if not moved.moved:
         return f"{moved.subtask} was not moved: {moved.why}"
     state = "started there" if moved.started else "not yet started there"

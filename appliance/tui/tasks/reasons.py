@@ -2,7 +2,7 @@
 
 from rich.text import Text
 
-from appliance.model import SubtaskRecord
+from appliance.model import SubtaskRecord, SubtaskState
 from appliance.tasks.why import AttemptWhy, SubtaskWhy, TaskWhy, Waits
 from appliance.tui.drawing import milliseconds, told
 from appliance.tui.safe import safe
@@ -70,7 +70,8 @@ def subtask_text(record: SubtaskRecord, reasons: SubtaskWhy | None, *, problem: 
         out.append(f"… {safe(record.note, 300)}\n", "yellow")
     if record.condition:
         out.append(f"▲ is {safe(record.condition, 40)}\n", "yellow")
-    if reasons is not None and reasons.waits is not None:
+    running = record.state is SubtaskState.RUNNING
+    if reasons is not None and reasons.waits is not None and not running:
         out.append_text(waits_text(reasons.waits))
     elif problem and not record.state.final:
         out.append(f"why it waits is not known: {safe(problem, 300)}\n", "dim")

@@ -9,13 +9,12 @@ from collections.abc import Callable, Mapping
 from rich.text import Text
 from textual import on, work
 from textual.app import ComposeResult
-from textual.containers import VerticalScroll
 from textual.widgets import Static
 
 from appliance.errors import ConflictError, PayloadError, PlanError, SwiftbotError
 from appliance.model import Plan, Proposal, Subtask, TaskRecord
 from appliance.tui.dialogs import ConfirmDialog
-from appliance.tui.drawing import Cell
+from appliance.tui.drawing import Cell, told
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
@@ -25,6 +24,7 @@ from appliance.tui.plans.editing import Draft, params_text
 from appliance.tui.safe import safe
 from appliance.tui.store import Store
 from appliance.tui.tasks.facts import reason, state_cell, waits
+from appliance.tui.widgets import Pane
 
 SUBTASKS = (
     Column(title="subtask", width=10, grow=True),
@@ -84,7 +84,7 @@ class ReviewScreen(FleetScreen):
         """Make the parts."""
         yield Static(id="about")
         yield Grid(SUBTASKS, step_cells, id="steps", empty="no plan waits")
-        with VerticalScroll(id="changes-box"):
+        with Pane(id="changes-box"):
             yield Static(id="changes")
 
     # --- drawing ---------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ class ReviewScreen(FleetScreen):
                 f"{'approved' if word.approved else 'rejected'} by {safe(word.by or 'somebody', 60)}"
                 f"{f': {safe(word.why, 120)}' if word.why else ''}"
                 if word is not None
-                else "no plan of it waits"
+                else told(record.failure) or "no plan of it waits"
             )
             out.append(f"\n▲ {said}; Esc leaves", "yellow")
         elif self.superseded:

@@ -3,7 +3,6 @@
 from rich.text import Text
 from textual import on
 from textual.app import ComposeResult
-from textual.containers import VerticalScroll
 from textual.widgets import Static
 
 from appliance.model import SubtaskState, TaskRecord
@@ -13,15 +12,19 @@ from appliance.tui.keys import bindings
 from appliance.tui.store import Store
 from appliance.tui.tasks.facts import reason, task_cells, task_text
 from appliance.tui.tasks.graph import TaskScreen
+from appliance.tui.widgets import Pane
 
 TASKS = (
     Column(title="task", width=12),
     Column(title="state", width=12),
     Column(title="done", width=5, right=True),
+    Column(title="%", width=4, right=True),
     Column(title="at", width=8, drop=2),
     Column(title="by", width=8, drop=3),
     Column(title="instruction", width=20, grow=True),
+    Column(title="waits for", width=24, grow=True, drop=4),
 )
+"""What a task waits for stands below the table too, of the selected one: narrow windows have no room for it twice."""
 _EMPTY = "no tasks yet: s submits one"
 
 
@@ -50,7 +53,7 @@ class TasksScreen(FleetScreen):
     def body(self) -> ComposeResult:
         """Make the parts."""
         yield Grid(TASKS, task_cells, id="tasks", empty=_EMPTY)
-        with VerticalScroll(id="detail-box"):
+        with Pane(id="detail-box"):
             yield Static(id="detail")
 
     def draw_body(self, store: Store) -> None:
@@ -63,10 +66,15 @@ class TasksScreen(FleetScreen):
             self.host.wanted_task = ""
         self._draw_detail()
 
+    def on_resize(self) -> None:
+        """Lay the plan out for the window."""
+        if self.ready:
+            self._draw_detail()
+
     @on(Grid.Moved)
     def _draw_detail(self) -> None:
         record: TaskRecord | None = self.query_one("#tasks", Grid).thing
-        self.say("#detail", Text() if record is None else task_text(record))
+        self.say("#detail", Text() if record is None else task_text(record, self.query_one("#detail-box").size.width))
 
     @on(Grid.Picked)
     def _open(self, event: Grid.Picked) -> None:

@@ -1,33 +1,36 @@
 """Takes an instruction, with history and completion of names, shows its plan, and submits exactly that plan."""
 
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from rich.text import Text
 from textual import on, work
 from textual.app import ComposeResult
 from textual.binding import Binding
-from textual.containers import Vertical, VerticalScroll
+from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Input, Label, Static
 
 from appliance.errors import PlanError, SwiftbotError
 from appliance.model import Approval, Site, TaskRecord, TaskRequest
 from appliance.tasks.api import PlanAnswer
+from appliance.tui.action import key_name
 from appliance.tui.data import View
+from appliance.tui.keys import DIALOG_KEYS
 from appliance.tui.plans import shape
 from appliance.tui.plans.completing import common, completions
 from appliance.tui.plans.history import History
 from appliance.tui.safe import safe
 from appliance.tui.tasks.facts import plan_lines
+from appliance.tui.widgets import Field, Pane
 
 _ASK = "Enter plans it · Tab completes names · ↑ earlier ones · Esc leaves"
-_REVIEW = "Enter runs this plan · F2 edits it first · edit the line for another · Esc leaves"
+_REVIEW = "Enter runs this plan · {key} edits it first · edit the line for another · Esc leaves"
 INSTRUCTION_LIMIT = 2000
 """Characters of an instruction; a gateway refuses longer ones as well."""
 
 
-class InstructionInput(Input):
+class InstructionInput(Field):
     """The line: Tab completes, the arrows bring back earlier instructions."""
 
     BINDINGS = [
@@ -105,11 +108,15 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
 
     BINDINGS = [
         Binding("escape", "leave", "Leave", priority=True),
-        Binding("f2,ctrl+r", "review", "Edit first", priority=True),
+        Binding(DIALOG_KEYS["edit-first"], "review", "Edit first", id="edit-first", priority=True),
     ]
 
-    def __init__(self, view: View, history: History, *, instruction: str = "") -> None:
+    def __init__(
+        self, view: View, history: History, *, instruction: str = "", own: Mapping[str, str] | None = None
+    ) -> None:
         super().__init__()
+        key = (own or {}).get("edit-first", DIALOG_KEYS["edit-first"]).split(",")[0].strip()
+        self._may = _REVIEW.format(key=key_name(key))
         self._view = view
         self._history = history
         self._first = instruction
@@ -125,7 +132,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         with Vertical(classes="dialog"):
             yield Label("What shall the robots do?", classes="title")
             yield InstructionInput(self._first, self._history, id="instruction")
-            with VerticalScroll(id="plan-box"):
+            with Pane(id="plan-box"):
                 yield Static(id="plan")
             yield Static(_ASK, id="hint")
 
@@ -184,7 +191,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         else:
             if self.query_one("#instruction", Input).value.strip() == instruction:
                 self._answer, self._planned = answer, instruction
-                self._show(answer_text(answer), _REVIEW)
+                self._show(answer_text(answer), self._may)
             else:
                 self._show(Text("The instruction was edited meanwhile.", "yellow"), _ASK)
         finally:

@@ -386,9 +386,10 @@ async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callab
 
 
 async def test_fetch_an_image(ann: Operator, fleet: FleetState) -> None:
-    """A gateway is asked to have an image; on one machine it has what the others have, and says so."""
-    await ann.line(f"fetch {reference(load_catalogue().images['base'], PoolConfig())} gw-2")
+    """A gateway is asked to have an image; on one machine it has what the others have, says so, and audits it."""
+    await ann.line(f"fetch {reference(load_catalogue().images['base'], PoolConfig())} gw-2 to be sure")
     await ann.hears("is on gw-2")
+    await ann.hears("image_fetch", "(to be sure)", "done")
 
 
 async def test_swap_the_model(ann: Operator, client: FleetClient, project_root: Path, tmp_path: Path) -> None:

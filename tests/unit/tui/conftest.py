@@ -169,8 +169,9 @@ class FakeOrders:
         self._store.take_task(record)
         return record
 
-    async def cancel(self, task: str) -> TaskRecord:
+    async def cancel(self, task: str, *, why: str = "") -> TaskRecord:
         """Answer with the task as it is."""
+        self.options["cancel"] = {"why": why}
         self._note("cancel", task)
         return RUNNING
 
@@ -186,6 +187,10 @@ class FakeOrders:
         self._note("stream", task)
         for line in self.lines:
             yield line
+
+    def knows_robot(self, name: str) -> bool:
+        """Whether the fleet has a robot of that name."""
+        return name in self._store.robots
 
     async def gateway(self) -> str:
         """Return any gateway."""

@@ -86,7 +86,7 @@ def test_command_line_is_read() -> None:
     assert grammar.read("sub  go  to 'the gate' ", {}).given == {"instruction": "go  to 'the gate'"}
     assert grammar.read("stop", {"robot": "r1"}).given == {}, "a stop of the fleet is not narrowed by a selection"
     assert grammar.read("resume-robots", {"robot": "r1"}).given == {"robot": "r1"}
-    for line in ("", "fly away", "cancel a b", "s"):
+    for line in ("", "fly away", "theme a b", "s"):
         with pytest.raises(grammar.UsageError):
             grammar.read(line, {})
 
@@ -158,6 +158,7 @@ CASES = [
     ("4", "e", "pool_evict", ("c1", ""), {"gw-a": Evicted(containers=("c1",))}, "gw-a: 1 given up"),
     ("3", "x", "stop", (("drone-1",),), StopAnswer(stops=(), robots=("drone-1",)), "holding: drone-1"),
     ("3", "z", "resume_robots", (("drone-1",),), StopAnswer(stops=()), "drone-1 may move again"),
+    ("3", "Z", "resume_robots", ((),), StopAnswer(stops=()), "all robots may move again"),
     ("3", "f8", "stop", ((),), StopAnswer(stops=(), silent=("gw-b",)), "not confirmed by gw-b"),
 ]
 
@@ -201,7 +202,7 @@ async def test_only_stops_that_were_seen_are_lifted(view: "FakeView") -> None:
         await pilot.press("y")
         await settle(app, pilot)
         assert view.orders.of("resume_robots") == [(("drone-1",),)]
-        assert view.orders.options["resume_robots"] == {"stops": ["seen"]}
+        assert view.orders.options["resume_robots"] == {"stops": ["seen"], "why": ""}
 
 
 LINES = [
@@ -327,7 +328,8 @@ async def test_same_order_twice_is_one(view: "FakeView") -> None:
     """While an order is under way, the same again is not given; the header tells what is under way."""
     asked = SimpleNamespace(count=0, go=asyncio.Event())
 
-    async def drain(*_: object) -> DrainState:
+    async def drain(*_: object, why: str) -> DrainState:
+        assert not why
         asked.count += 1
         await asked.go.wait()
         return DRAINING

@@ -8,12 +8,13 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import PlanError, RefusedError, UnreachableError
-from appliance.model import Notice, TaskRecord, TaskState
+from appliance.model import LogLine, Notice, RunEvent, RunEventKind, TaskRecord, TaskState, encode
 from appliance.record.facts import RecorderStatus
 from appliance.tui.actions import ACTIONS
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.dialogs import ConfirmDialog
 from appliance.tui.grid import Grid
+from appliance.tui.hearing import Hearing
 from appliance.tui.help import HelpDialog
 from appliance.tui.running import export_picture
 from appliance.tui.settings import TuiConfig
@@ -123,6 +124,28 @@ async def test_log_grows_and_is_filtered(view: "FakeView") -> None:
         assert "battery low" in text
         await pilot.press("escape")
         assert "inspection done" in await settle(app, pilot)
+
+
+async def test_log_begins_at_its_newest_line(view: "FakeView") -> None:
+    """Shown for the first time, with more lines than the window has, the log stands at the newest and follows."""
+    for number in range(100):
+        view.store.add(10**18, kind="log", level="info", source="gw-a", text=f"line {number}.")
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("7")
+        text = await settle(app, pilot)
+        assert "line 99." in text
+        assert "line 0." not in text
+
+
+async def test_log_has_whose_lines_it_is_and_no_signs_of_life(view: "FakeView") -> None:
+    """A line that names nobody is its gateway's, by the key it came on; that a run is alive is no line."""
+    hearing = Hearing(view.store, "test")
+    line = LogLine(at_ns=1, level="info", source="", event="container ready")
+    assert hearing.hear("swiftbot/test/gw/gw-b/log", encode(line), 1)
+    for kind in (RunEventKind.ALIVE, RunEventKind.STARTED):
+        view.store.take_run(RunEvent(task="t", subtask="s", attempt=1, kind=kind, gateway="gw-b"), 1)
+    assert [(each.source, each.kind) for each in view.store.entries] == [("gw-b", "log"), ("gw-b", "run")]
 
 
 async def test_rows_are_filtered_per_screen(view: "FakeView") -> None:
@@ -327,7 +350,7 @@ async def test_selection_stays_when_tasks_come(view: "FakeView") -> None:
 async def test_help_lists_every_action(view: "FakeView") -> None:
     """The help shows each action of the one list."""
     app = SwiftbotApp(view)
-    async with app.run_test(size=(100, 120)) as pilot:
+    async with app.run_test(size=(120, 140)) as pilot:
         await pilot.press("question_mark")
         await pilot.pause()
         assert isinstance(app.screen, HelpDialog)

@@ -2,6 +2,7 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.cells import cell_len
 
 from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState
 from appliance.tui import drawing
@@ -22,6 +23,17 @@ def plans(draw: st.DrawFn) -> Plan:
         for number in range(count)
     ]
     return Plan(domain="d", subtasks=tuple(draw(st.permutations(subtasks))))
+
+
+@settings(deadline=None)
+@given(text=st.text(st.sampled_from("ab 漢é·"), max_size=120), margin=st.integers(0, 8), width=st.integers(0, 60))
+def test_what_takes_several_lines_hangs_below_its_first(text: str, margin: int, width: int) -> None:
+    """Every line has the margin, the words are those of the text, and only a word longer than a line is too long."""
+    lines = drawing.hanging(text, " " * margin, width).split("\n")
+    assert all(line.startswith(" " * margin) for line in lines)
+    assert " ".join(line[margin:] for line in lines).split() == text.split()
+    if width > margin + 20:
+        assert all(cell_len(line) <= width or " " not in line[margin:].strip() for line in lines)
 
 
 @settings(deadline=None)

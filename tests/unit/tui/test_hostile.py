@@ -33,7 +33,7 @@ from appliance.tui import dialogs
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.grid import Column, fit, widths
 from appliance.tui.hearing import Hearing
-from appliance.tui.screens import fleet, gateway, llm, pool
+from appliance.tui.screens import condition, fleet, gateway, llm, pool
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Gateway, Start, Store
 
@@ -92,8 +92,8 @@ def test_rows_are_harmless(text: str, number: float) -> None:
     decision = ("g", PoolDecision(at_ns=status.started_ns, what=text, image=text, container=text, why=text))
     parts = [
         fleet.gateway_cells(each),
-        *fleet.gateway_notes([each]),
-        *fleet.recorder_notes([RecorderStatus(id=text, fleet="f", state=text, problem=text, dropped={text: 1})]),
+        *condition.gateway_notes([each]),
+        *condition.recorder_notes([RecorderStatus(id=text, fleet="f", state=text, problem=text, dropped={text: 1})]),
         gateway.about(each, store),
         llm.model_cells(each),
         llm.about(each),
