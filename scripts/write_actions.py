@@ -16,6 +16,7 @@ from write_configuration import fields
 
 from appliance.tui import themes
 from appliance.tui.actions import ACTIONS, SCREENS
+from appliance.tui.keys import names
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "tui.md"
@@ -60,6 +61,13 @@ def settings() -> str:
     return _table(("key", "default", "meaning"), rows)
 
 
+def keys() -> str:
+    """What besides actions can be given other keys."""
+    actions = {action.name for action in ACTIONS}
+    rows = [(f"`{name}`", f"`{','.join(usual)}`") for name, usual in names().items() if name not in actions]
+    return _table(("name", "usual keys"), rows)
+
+
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     head = tuple(head)
     lines = [head, ["---"] * len(head), *rows]
@@ -68,7 +76,10 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def page(text: str) -> str:
     """Return the page with its tables made anew."""
-    for name, table in (("actions", actions()), ("screens", screens()), ("themes", looks()), ("settings", settings())):
+    tables = {
+        "actions": actions(), "screens": screens(), "themes": looks(), "settings": settings(), "keys": keys(),
+    }  # fmt: skip
+    for name, table in tables.items():
         pattern = rf"(<!-- {name} -->\n)(?:\|[^\n]*\n)*(<!-- end -->)"
         text = re.sub(pattern, lambda found, table=table: f"{found[1]}{table}\n{found[2]}", text)
     return text

@@ -62,7 +62,7 @@ def future(view: "FakeView") -> Iterator["FakeView"]:
     [
         (("2",), ("? drea␛[31m[red]", "? s1 goto", "levi␛[5mtating")),
         (("2", "enter"), ("? drea␛[31m[red]", "? levi␛[5m")),
-        (("3",), ("rover-9", "tele␇", "sinking␛]0;x")),
+        (("3",), ("rover-9", "tele␇", "sinking␛]0;")),
         (("3", "end", "enter"), ("tele␇pathic", "sinking␛]0;x␇")),
         (("4",), ("c9", "? hiber�")),
     ],

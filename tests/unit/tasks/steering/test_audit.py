@@ -6,6 +6,7 @@ import pytest
 
 from appliance.errors import ConflictError
 from appliance.model import Act, TaskRecord, encode
+from appliance.pool.transfer.api import FetchAsk
 from appliance.robots.authority.api import StopAsk
 from appliance.tasks.steering.api import ActsAsk, PauseAsk, RetryAsk
 from appliance.tasks.steering.audit import KEPT, Audit, target_of
@@ -67,3 +68,4 @@ def test_an_order_names_what_it_is_about() -> None:
     assert target_of(RetryAsk(id="t", subtask="s1")) == "t/s1"
     assert target_of(StopAsk(robots=("r1", "r2"))) == "r1, r2"
     assert target_of(StopAsk()) == "the fleet"
+    assert target_of(FetchAsk(reference="localhost/base:1")) == "localhost/base:1"
