@@ -298,14 +298,17 @@ def tui(
         )
     endpoint = Endpoint(fleet=where.fleet, connect=()) if replay is not None else where.endpoint()
     if serve:
-        _serve_tui(endpoint, port=port, write=own.write)
+        # Each browser's terminal UI is a process of its own: it is told all that was asked for here.
+        options = ["--theme", own.theme] + (["--write"] if own.write else [])
+        options += ["--config", str(config)] if config is not None else []
+        _serve_tui(endpoint, port=port, options=options)
     else:
         plane = PlaneConfig(mode="client", connect=endpoint.connect)
         asyncio.run(run_tui(plane, endpoint.fleet, own, replay=replay))
     return 0
 
 
-def _serve_tui(endpoint: Endpoint, *, port: int, write: bool) -> None:
+def _serve_tui(endpoint: Endpoint, *, port: int, options: list[str]) -> None:
     """Serve the terminal UI until SIGTERM or Ctrl-C."""
     from appliance.tui.serve.running import serve
 
@@ -319,6 +322,6 @@ def _serve_tui(endpoint: Endpoint, *, port: int, write: bool) -> None:
             print(address, flush=True)
             console.err.print("whoever knows this address may look, and unlock; Ctrl-C ends it")
 
-        await serve(endpoint.fleet, endpoint.connect, port=port, write=write, stop=stop, tell=tell)
+        await serve(endpoint.fleet, endpoint.connect, port=port, options=options, stop=stop, tell=tell)
 
     asyncio.run(go())

@@ -13,12 +13,18 @@ TOKEN = "SWIFTBOT_TUI_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable of a token of one's own."""
 
 
+def session_command(fleet: str, connect: Sequence[str], options: Sequence[str]) -> list[str]:
+    """Return the command of one browser's terminal UI."""
+    words = [word for each in connect for word in ("--connect", each)]
+    return [sys.executable, "-m", "appliance.cli", "tui", "--fleet", fleet, *words, *options]
+
+
 async def serve(
     fleet: str,
     connect: Sequence[str],
     *,
     port: int,
-    write: bool,
+    options: Sequence[str],
     stop: asyncio.Event,
     tell: Callable[[str], object],
 ) -> None:
@@ -28,7 +34,7 @@ async def serve(
         fleet: its name.
         connect: endpoints of its gateways or routers.
         port: where to listen; 0: any that is free.
-        write: whether sessions start unlocked.
+        options: of `swiftbot tui` for each session, such as `--write`: without it sessions start locked.
         stop: ends it.
         tell: takes the address, which has the token in it.
 
@@ -39,10 +45,7 @@ async def serve(
     token = os.environ.pop(TOKEN, "") or make_token()
     listening = listen(port)
     port = listening.getsockname()[1]
-    command = [sys.executable, "-m", "appliance.cli", "tui", "--fleet", fleet]
-    command += [word for each in connect for word in ("--connect", each)]
-    if write:
-        command.append("--write")
+    command = session_command(fleet, connect, options)
     try:
         server = BrowserServer(command, Guard(token, port), title=f"SwiftBot · {fleet}")
     except ConfigError:

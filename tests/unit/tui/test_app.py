@@ -318,6 +318,49 @@ async def test_lost_connection_has_a_banner(view: "FakeView") -> None:
         assert "no gateway of fleet" not in await settle(app, pilot)
 
 
+async def test_what_is_typed_outlives_the_connection(view: "FakeView") -> None:
+    """An instruction, its plan and a command line stay while the connection is lost and made anew, and go on then."""
+    lost = Connection(problem="no gateway", remedy="start one")
+    app = SwiftbotApp(view, UNLOCKED)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("colon", *"drain gw")
+        for connection in (lost, Connection(connected=True)):
+            view.store.tell(connection)
+            assert "drain gw" in await settle(app, pilot)
+        await pilot.press("escape", "s", *"look")
+        for connection in (lost, Connection(connected=True)):
+            view.store.tell(connection)
+            assert "look" in await settle(app, pilot)
+        await pilot.press("enter")
+        await settle(app, pilot)
+        view.store.tell(lost)
+        assert "inspection: 4 subtasks" in await settle(app, pilot)
+        view.store.tell(Connection(connected=True))
+        await pilot.press("enter")
+        await settle(app, pilot)
+        assert [call[0] for call in view.orders.of("submit")] == ["look"]
+
+
+async def test_screens_that_are_not_seen_are_idle(view: "FakeView") -> None:
+    """A screen behind another draws nothing, asks nothing, whatever comes, and is up to date when it is shown."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("2")
+        await settle(app, pilot)
+        grid = app.screen.query_one("#tasks", Grid)
+        await pilot.press("4")
+        await settle(app, pilot)
+        await pilot.press("1")
+        await settle(app, pilot)
+        drawn, asked = grid.drawn, len(view.orders.of("pool_decisions"))
+        view.store.take_task(TaskRecord(id="t-new", instruction="x", created_ns=9))
+        await settle(app, pilot)
+        assert (grid.drawn, len(grid.keys)) == (drawn, 2)
+        assert len(view.orders.of("pool_decisions")) == asked
+        await pilot.press("2")
+        assert "t-new" in await settle(app, pilot)
+
+
 async def test_unchanged_rows_are_not_drawn(view: "FakeView") -> None:
     """Only rows whose thing is another are drawn again: one gateway's new load is one line."""
     app = SwiftbotApp(view)

@@ -104,6 +104,31 @@ async def test_plan_is_edited_checked_and_approved(view: "FakeView") -> None:
     assert [(each.id, each.robot, each.params) for each in plan.subtasks] == [("s1", "rover-2", {"place": "dock"})]
 
 
+async def test_order_is_edited_and_taken_back(view: "FakeView") -> None:
+    """`o` writes what a subtask comes after, `[` and `]` exchange neighbours, `u` goes back: each is checked anew."""
+    app = SwiftbotApp(view, TuiConfig(write=True))
+    async with app.run_test(size=SIZE) as pilot:
+        screen = await reviewing(app, pilot, view)
+
+        def order() -> list[tuple[str, tuple[str, ...]]]:
+            return [(each.id, each.after) for each in screen.draft.subtasks] if screen.draft is not None else []
+
+        proposed = order()
+        await pilot.press("down", "o")
+        await until(app, pilot, "edit-after s2 s1")
+        await pilot.press("backspace", "backspace", "minus", "enter")
+        await until(app, pilot, "after: s1 → nothing", "✔ checked: it may run")
+        assert dict(order()) == {"s1": (), "s2": ()}
+        await pilot.press("u")
+        await until(app, pilot, "as proposed", lambda: order() == proposed)
+        await pilot.press("left_square_bracket")
+        await until(app, pilot, "✔ checked: it may run", lambda: dict(order()) == {"s1": ("s2",), "s2": ()})
+        screen.query_one("#steps").select("s2")  # pyright: ignore[reportAttributeAccessIssue]
+        await pilot.press("right_square_bracket")
+        await until(app, pilot, lambda: dict(order()) == dict(proposed))
+        assert len(view.orders.of("check_plan")) >= 2
+
+
 async def test_invalid_edit_is_not_approved(view: "FakeView") -> None:
     """What the validator finds stands below the plan, and approval is refused until it is mended."""
     app = SwiftbotApp(view, TuiConfig(write=True))
