@@ -237,7 +237,7 @@ class TakeoverScreen(FleetScreen):
 
     def _pad(self, left_s: float) -> Text:
         robot = self.store.robots.get(self.robot_id)
-        at = f" · at {place(robot.pose)} m" if robot is not None else ""
+        at = f" · {place(robot.pose)} m" if robot is not None else ""
         if self._ended:
             return Text.assemble(
                 ("▲ not under your hand: ", "bold yellow"), (safe(self._ended, 300), "yellow"), "\nEsc leaves"
@@ -249,8 +249,8 @@ class TakeoverScreen(FleetScreen):
             ("⇅ yours", "bold magenta"),
             f"{at} · {SPEEDS[self._speed]:g} m/s · ",
             (f"● {moving}" if moving else "‖ holds", "bold yellow" if moving else ""),
-            f" · given back without a key in {left_s:.0f} s\n",
-            ("hold ↑ ↓ to move, ← → to turn, a d sideways, PgUp PgDn up and down · Space holds · + − speed", "dim"),
+            f" · back in {left_s:.0f} s without a key\n",
+            ("hold ↑ ↓ move · ← → turn · a d aside · PgUp PgDn · Space holds · + − speed", "dim"),
         )
         if self._problem:
             out.append(f"\n✘ {safe(self._problem, 300)}", "red")
