@@ -50,7 +50,7 @@ _ATTEMPT_S = 1.5
 _AGAIN_S = 0.03
 """Between tries while the membership settles."""
 _APART_S = 1.0
-"""How long a reader asks again when whoever it takes for a key's owner says that the key is another's."""
+"""How long a reader asks again when whom it takes for a key's owner is not there, or says that the key is another's."""
 _SETTLE_S = 2.0
 """How long an owner lets requests wait for its reconciling; then it answers with what it has."""
 _RETURNED_S = 0.4
@@ -140,7 +140,8 @@ class Dht:
         """Ask the holders of a key one after the other, until one has it or knows that there is none.
 
         Returns:
-            What was found, and whether the first of them says that the key is another's: views differ for a moment.
+            What was found, and whether that may be about to change: the owner says that the key is another's, or is not
+            there or about to go, of which the membership will tell.
         """
         holders = list(await self._membership.holders(key, self._config.replicas))
         owner, problems, apart = holders[0], dict[str, str](), False
@@ -157,6 +158,7 @@ class Dht:
                     )
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 problems[gateway] = str(error)
+                apart = apart or (gateway == owner and not isinstance(error, DeadlineError))
                 continue
             if found.record is not None or not found.unsure:
                 return found, False

@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.errors import ConflictError, DeadlineError, UnreachableError
@@ -28,6 +29,12 @@ def key_of(plane: Plane, *holders: str, other_than: str = "") -> str:
     """A key whose first holders are these, in that order."""
     keys = (f"task/{number}" for number in range(200_000))
     return next(key for key in keys if plane.ring.successors(key, len(holders)) == holders and key != other_than)
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a loaded machine an owner that answers is late, and that is not what these tests are about."""
+    monkeypatch.setattr(dht, "_ATTEMPT_S", 60.0)
 
 
 @pytest.fixture
@@ -99,6 +106,32 @@ async def test_what_its_owner_does_not_have_is_not_there(planes: list[Plane], *,
             assert await plane.dht.read(key, replica=replica) is None
 
 
+async def test_a_reader_asks_the_next_owner_when_the_first_is_just_going(
+    planes: list[Plane], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked while it still counts as there: who follows it knows that there is no record."""
+    monkeypatch.setattr(dht, "_APART_S", 3600.0)
+    asker, owner = planes[0], planes[1]
+    key, asked, call = key_of(asker, "g1", "g2", "g3"), asyncio.Event(), asker.rpc.call
+
+    async def watched(gateway: str, *rest: Any, **more: Any) -> Any:
+        try:
+            return await call(gateway, *rest, **more)
+        except UnreachableError:
+            asked.set()
+            raise
+
+    monkeypatch.setattr(asker.rpc, "call", watched)
+    owner.rpc.close()
+    reading = asyncio.create_task(asker.dht.read(key))
+    await asked.wait()
+    assert not reading.done()
+    for plane in planes:
+        if plane is not owner:
+            plane._membership._seen(plane.keys.alive("g1"), alive=False)
+    assert await reading is None
+
+
 async def test_an_owner_that_has_not_compared_its_copies_says_so(
     planes: list[Plane], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,7 +183,7 @@ async def test_a_silent_member_holds_up_no_takeover_and_may_have_what_is_missing
     assert len(losses) == 1
     assert "g1" in losses[0]
     assert {within_s for _, within_s in asked if within_s is not None} == {reconcile.LOSS_S}
-    assert successor.dht.absence.silent == {"g1"}
+    await until(lambda: successor.dht.absence.silent == {"g1"})  # others may be late on a loaded machine
     assert (await successor.dht.read(key) or newer).value == b"before"
     with pytest.raises(UnreachableError, match="g1 may have it"):
         await successor.dht.read(missing)
@@ -212,6 +245,8 @@ async def test_a_silent_member_that_has_come_back_holds_up_no_write(
         await asyncio.Event().wait()
 
     monkeypatch.setattr(owner._reconciler._comparing, "compare", never)
+    slowly = msgspec.structs.replace(owner.config, replica_timeout_s=60.0)
+    monkeypatch.setattr(owner.dht._pushing, "_config", slowly)
     meanwhile = Record(key=newer, value=b"meanwhile", version={**versions[newer], "g1": 1}, write="w")
     await back.dht.keep(meanwhile)
     membership._seen(token, alive=True)
