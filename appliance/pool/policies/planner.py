@@ -272,7 +272,7 @@ class Planner:
             busy = view.busy.get(image, 0)
             ahead_s = self._ahead_s(image)
             count = firm = sure = self._settings.floor.get(image, 0)
-            why = f"{count} of it are always kept ready (pool.floor)"
+            why = f"pool.floor keeps {count} ready"
             while count < view.capacity:
                 reason, surety = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
                 if not reason:

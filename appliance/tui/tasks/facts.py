@@ -70,7 +70,7 @@ def task_cells(record: TaskRecord) -> tuple[Cell, ...]:
         clock(record.created_ns)[:8],
         safe(record.submitter, 20),
         what,
-        (reason(record), "yellow"),
+        (reason(record).removeprefix("waits for "), "yellow"),
     )
 
 
@@ -174,7 +174,8 @@ def subtask_lines(record: SubtaskRecord, depth: int, width: int = 0) -> Text:
     """Draw one subtask: what it is and how it stands, where and how long, and why it failed."""
     sign = signs.subtask(record.state)
     subtask = record.subtask
-    out = Text(shape.branch(depth), "dim")
+    # Not as the style of the whole text: all that follows would be dim as well.
+    out = Text.assemble((shape.branch(depth), "dim"))
     out.append(f"{sign.glyph} {safe(subtask.id, 40)} ", f"bold {sign.style}")
     out.append(safe(subtask.skill, 60), "cyan")
     out.append(f" {safe(_robot(record) or 'on a gateway', 63)}")
