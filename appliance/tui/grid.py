@@ -65,7 +65,7 @@ class Grid(ScrollView, can_focus=True, inherit_bindings=False):
     Grid { height: 1fr; scrollbar-size: 1 1; overflow-x: hidden; background: $background; color: $foreground; }
     Grid .grid--head { color: $text-muted; text-style: bold; }
     Grid .grid--cursor { background: $panel; }
-    Grid:focus .grid--cursor { background: $primary 40%; text-style: bold; }
+    Grid:focus .grid--cursor { background: $cursor; text-style: bold; }
     """
 
     class About(Message):

@@ -135,6 +135,10 @@ class Shell(App[None], inherit_bindings=False):
         for each in screens:
             each.look = self.theme
 
+    def get_theme_variable_defaults(self) -> dict[str, str]:
+        """Return variables that themes have beside Textual's: its own theme, until ours is set, lacks them."""
+        return {"cursor": themes.LOOKS[0].cursor}
+
     def set_look(self, name: str) -> None:
         """Change the colours."""
         look = themes.BY_NAME[name]

@@ -28,6 +28,20 @@ class Look(Struct, frozen=True, kw_only=True):
     leaving: str
     past: str
 
+    @property
+    def panel(self) -> str:
+        """The ground of header, footer and fields: near enough to the other for all colours to be read on it."""
+        return _between(self.ground, self.text, 0.1)
+
+    @property
+    def cursor(self) -> str:
+        """The ground of the selected row, which a sign and bold letters tell as well."""
+        return _between(self.ground, self.primary, 0.15)
+
+    def dimmed(self, ground: str) -> str:
+        """What past and idle things look like on a ground: as Textual mixes them."""
+        return _between(ground, self.text, 0.66)
+
     def theme(self) -> Theme:
         """Return it as Textual has it."""
         return Theme(
@@ -41,10 +55,10 @@ class Look(Struct, frozen=True, kw_only=True):
             foreground=self.text,
             background=self.ground,
             surface=self.ground,
-            panel=_between(self.ground, self.text, 0.18),
+            panel=self.panel,
             dark=self.dark,
             text_alpha=1.0,
-            variables={"footer-key-foreground": self.primary, "text-muted": self.past},
+            variables={"footer-key-foreground": self.primary, "text-muted": self.past, "cursor": self.cursor},
         )
 
     def terminal(self) -> TerminalTheme:

@@ -54,7 +54,7 @@ class ReplayScreen(FleetScreen):
     BINDINGS = bindings("replay")
     DEFAULT_CSS = """
     ReplayScreen #about { height: auto; padding: 0 1; }
-    ReplayScreen #files { height: 1fr; border-top: solid $panel; }
+    ReplayScreen #files { height: 1fr; border-top: solid $foreground 30%; }
     """
 
     def __init__(self) -> None:

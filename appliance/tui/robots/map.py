@@ -240,10 +240,10 @@ def _places(canvas: Canvas, view: View, places: Mapping[str, tuple[float, float]
             continue
         row, column = cell
         if canvas.free(row, column, 1):
-            canvas.write(row, column, "+", "cyan dim")
+            canvas.write(row, column, "+", "cyan")
         label = safe(name, _LABEL)
         if canvas.free(row, column + 1, cell_len(label) + 1):
-            canvas.write(row, column + 1, label, "cyan dim")
+            canvas.write(row, column + 1, label, "cyan")
 
 
 def _scale(view: View, columns: int, robots: int) -> Line:

@@ -41,9 +41,9 @@ class RobotsScreen(FleetScreen):
     RobotsScreen #parts.wide { layout: horizontal; }
     RobotsScreen #list { height: 1fr; }
     RobotsScreen #selected { height: auto; max-height: 3; padding: 0 1; }
-    RobotsScreen #ground { height: 1fr; border-top: solid $panel; }
+    RobotsScreen #ground { height: 1fr; border-top: solid $foreground 30%; }
     RobotsScreen #parts.wide #list { width: 3fr; height: 100%; }
-    RobotsScreen #parts.wide #ground { width: 2fr; height: 100%; border-top: none; border-left: solid $panel; }
+    RobotsScreen #parts.wide #ground { width: 2fr; height: 100%; border-top: none; border-left: solid $foreground 30%; }
     """
 
     def __init__(self) -> None:
@@ -114,7 +114,7 @@ class RobotScreen(FleetScreen):
     BINDINGS = bindings("robot")
     DEFAULT_CSS = """
     RobotScreen #about-box { height: 1fr; padding: 0 1; scrollbar-size: 1 1; }
-    RobotScreen #ground { height: 1fr; border-top: solid $panel; }
+    RobotScreen #ground { height: 1fr; border-top: solid $foreground 30%; }
     """
 
     def __init__(self, robot: str) -> None:

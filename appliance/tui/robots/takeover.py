@@ -92,7 +92,7 @@ class TakeoverScreen(FleetScreen):
     shows = ("robots", "tasks", "gateways", "enquiries", "stops")
     BINDINGS = bindings("takeover")
     DEFAULT_CSS = """
-    TakeoverScreen #pad { height: auto; padding: 0 1; border-bottom: solid $panel; }
+    TakeoverScreen #pad { height: auto; padding: 0 1; border-bottom: solid $foreground 30%; }
     TakeoverScreen #ground { height: 1fr; }
     """
 

@@ -137,7 +137,7 @@ class LlmScreen(FleetScreen):
     shows = ("gateways", "tasks")
     BINDINGS = bindings("llm")
     DEFAULT_CSS = """
-    LlmScreen #about { height: auto; max-height: 10; padding: 0 1; border-top: solid $panel; }
+    LlmScreen #about { height: auto; max-height: 10; padding: 0 1; border-top: solid $foreground 30%; }
     LlmScreen #share { height: auto; padding: 0 1; }
     """
 

@@ -117,7 +117,7 @@ class PoolScreen(FleetScreen):
     shows = ("containers", "starts", "asked", "gateways")
     BINDINGS = bindings("pool")
     DEFAULT_CSS = """
-    PoolScreen #starts { height: auto; padding: 0 1; border-top: solid $panel; }
+    PoolScreen #starts { height: auto; padding: 0 1; border-top: solid $foreground 30%; }
     PoolScreen #problems { height: auto; max-height: 4; padding: 0 1; }
     PoolScreen #decisions { height: auto; max-height: 40%; padding: 0 1; }
     """

@@ -67,7 +67,7 @@ class TaskScreen(FleetScreen):
     DEFAULT_CSS = """
     TaskScreen #about { height: auto; max-height: 6; padding: 0 1; }
     TaskScreen #subtasks { height: 2fr; min-height: 3; }
-    TaskScreen #detail-box { height: 3fr; border-top: solid $panel; scrollbar-size: 1 1; padding: 0 1; }
+    TaskScreen #detail-box { height: 3fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; padding: 0 1; }
     TaskScreen #detail-box:focus { border-top: solid $accent; }
     """
 

@@ -59,7 +59,7 @@ class ReviewScreen(FleetScreen):
     DEFAULT_CSS = """
     ReviewScreen #about { height: auto; max-height: 5; padding: 0 1; }
     ReviewScreen #steps { height: 1fr; min-height: 3; }
-    ReviewScreen #changes-box { height: 1fr; border-top: solid $panel; scrollbar-size: 1 1; padding: 0 1; }
+    ReviewScreen #changes-box { height: 1fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; padding: 0 1; }
     ReviewScreen #changes-box:focus { border-top: solid $accent; }
     """
 

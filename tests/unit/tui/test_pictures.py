@@ -89,11 +89,13 @@ async def test_other_sizes_are_never_refused(fleet: "FakeView", screen: str, siz
 
 @pytest.mark.parametrize("name", sorted(themes.BY_NAME))
 def test_theme_can_be_read(name: str) -> None:
-    """Every colour stands out from the ground: 4.5 to 1 at least, 7 to 1 in the themes of high contrast."""
+    """Every colour stands out from each ground: 4.5 to 1 at least, 7 to 1 in high contrast; what is past 4.5, or 6."""
     look = themes.BY_NAME[name]
-    least = 7.0 if name.startswith("contrast") else 4.5
-    for part in ("text", "primary", "well", "works", "broken", "next", "leaving", "past"):
-        assert themes.contrast(getattr(look, part), look.ground) >= least, part
+    least, past = (7.0, 6.0) if name.startswith("contrast") else (4.5, 4.5)
+    for ground in (look.ground, look.panel, look.cursor):
+        for part in ("text", "primary", "well", "works", "broken", "next", "leaving", "past"):
+            assert themes.contrast(getattr(look, part), ground) >= least, (part, ground)
+        assert themes.contrast(look.dimmed(ground), ground) >= past, ground
 
 
 async def test_no_colour_is_respected(fleet: "FakeView", monkeypatch: pytest.MonkeyPatch) -> None:
