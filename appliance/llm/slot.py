@@ -26,6 +26,7 @@ import msgspec
 
 from appliance.llm import frames
 from appliance.llm.embedded import remedy_of
+from appliance.llm.language.evidence import read_evidence
 from appliance.llm.speaking import BrokenOffError, Question, Speaker, TooLateError, TooLongError, read_card
 
 if TYPE_CHECKING:
@@ -92,9 +93,14 @@ class Slot:
             ) from error
         try:
             card = read_card(folder)
+            evidence = None if card is None else read_evidence(folder)
         except ValueError as error:
             raise SlotError("prerequisite", str(error), "copy the model folder again") from error
-        self.speaker = None if card is None else Speaker(og, self._model, self._tokenizer, card, context=context)
+        self.speaker = (
+            None
+            if card is None
+            else Speaker(og, self._model, self._tokenizer, card, context=context, evidence=evidence)
+        )
         """For a model that writes the plan language; others are asked in JSON under a grammar."""
         self._limit = min(max_tokens, context)
         self._generator: Any = None

@@ -3,9 +3,10 @@
 Each step takes the likeliest of the symbols that may come (`language.guide`). What the model would have said otherwise
 is not lost: the share of the chosen symbol among the allowed ones says how sure it was, and where another one had a
 fair share the answer is gone through again from there. Given is the likeliest whole answer, what it leaves unsaid
-counted against it (`language.coverage`), and the others behind it.
+counted against it (`language.coverage`) and what the words speak for besides (`language.evidence`), and the others
+behind it.
 A model folder has, beside what the library needs, `planner.json`: which token is which symbol, and how shares become
-a confidence.
+a confidence; it may have `evidence.bin`.
 """
 
 import heapq
@@ -21,6 +22,7 @@ import msgspec
 from msgspec import Struct
 
 from appliance.llm.language.coverage import covered
+from appliance.llm.language.evidence import Evidence, skills_of, support
 from appliance.llm.language.guide import END, Guide, SkillShape
 from appliance.llm.language.words import MAX_WORDS, words_of
 
@@ -29,6 +31,8 @@ MOST_SYMBOLS = 600
 """Of an answer; a longer one is none."""
 SAID = 1.0
 """What each word that an answer points at is worth, in nats; chosen on held-out pairs (docs/planner.md)."""
+EVIDENCE = 0.6
+"""What a nat of the second opinion on an answer's skills is worth; chosen on held-out pairs too."""
 TURNS, THOROUGH = 4, 12
 """Answers that are tried besides the one that is likeliest step by step; each takes half an answer's time or so."""
 MOST_OF = 0.5
@@ -123,10 +127,14 @@ class Speaker:
         tokenizer: of the library.
         card: which token is which symbol.
         context: tokens that prompt and answer may have.
+        evidence: a second opinion on which skills an answer has; None where the folder has none.
     """
 
-    def __init__(self, og: Any, model: Any, tokenizer: Any, card: Card, *, context: int) -> None:
+    def __init__(
+        self, og: Any, model: Any, tokenizer: Any, card: Card, *, context: int, evidence: Evidence | None = None
+    ) -> None:
         self._tokenizer = tokenizer
+        self._evidence = evidence
         self._card = card
         self._context = context
         self._known = frozenset(card.tokens)
@@ -149,7 +157,10 @@ class Speaker:
         """
         began = time.monotonic()
         words = words_of(question.text, question.robots or ())
-        prompt = self._prompt([words[number].lower() for number in range(len(words))], words.own)
+        said_words = [words[number].lower() for number in range(len(words))]
+        prompt = self._prompt(said_words, words.own)
+        odds = {} if self._evidence is None else self._evidence.odds(said_words[: words.own])
+        odds = {skill: value for skill, value in odds.items() if skill in question.skills and skill in self._known}
         until = began + question.deadline_s
         generator = self._new()
         generator.append_tokens(prompt)
@@ -198,7 +209,11 @@ class Speaker:
             for each in begun.turns:
                 if each.share >= fair:
                     heapq.heappush(turns, (each.cost, next(number), each, begun))
-        paths.sort(key=lambda path: path.cost - SAID * covered(path.symbols, words))
+        paths.sort(
+            key=lambda path: (
+                path.cost - SAID * covered(path.symbols, words) - EVIDENCE * support(odds, skills_of(path.symbols))
+            )
+        )
         return Said(
             symbols=tuple(paths[0].symbols),
             others=tuple(Other(tuple(path.symbols), self._confidence(path.cost)) for path in paths[1:]),

@@ -9,10 +9,12 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError, PrerequisiteError
 from appliance.llm import speaking
 from appliance.llm.language.coverage import covered
+from appliance.llm.language.evidence import FILE, UNSAID, Evidence, skills_of
 from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import MAX_WORDS, words_of
 from appliance.llm.local import LocalTier
@@ -119,6 +121,48 @@ def test_the_likeliest_whole_answer_is_given(folder: Path, monkeypatch: pytest.M
         surer = [each.symbols for each in fuller.others if each.confidence > fuller.confidence]
         assert {fuller.symbols, *(each.symbols for each in fuller.others)} == set(answers)
         assert all(covered(fuller.symbols, words) >= covered(each, words) for each in surer)
+
+
+def test_the_words_have_a_say_in_which_answer_is_given(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the same answers one with a skill that they speak for is given, each as sure as without such an opinion.
+
+    One on skills that the question does not have changes nothing.
+    """
+    speaker = Slot(folder).speaker
+    assert speaker is not None
+    monkeypatch.setattr(speaking, "TURNS", 12)
+    monkeypatch.setattr(speaking, "FAIR", 0.0)
+    monkeypatch.setattr(speaking, "LONGER", 100)
+    question = Question(text=INSTRUCTIONS[0], robots=("rover_1",), skills=shapes(CATALOGUE), deadline_s=60.0)
+    plain = speaker.answer(question)
+    answers = [plain.symbols, *(each.symbols for each in plain.others)]
+    given = skills_of(plain.symbols)
+    other = next(skill for each in answers for skill in sorted(skills_of(each) - given - UNSAID))
+    favours = Evidence(skills=(other,), bias=(200.0,), scale=1.0, rows={})
+    monkeypatch.setattr(speaker, "_evidence", favours)
+    said = speaker.answer(question)
+    assert other in skills_of(said.symbols)
+    sure = {plain.symbols: plain.confidence} | {each.symbols: each.confidence for each in plain.others}
+    assert {said.symbols: said.confidence} | {each.symbols: each.confidence for each in said.others} == sure
+    monkeypatch.setattr(speaker, "_evidence", replace(favours, skills=("weld",)))
+    assert speaker.answer(question).symbols == plain.symbols
+
+
+@pytest.mark.parametrize("damage", [b"", b"no evidence"])
+async def test_damaged_evidence_is_named(folder: Path, tmp_path: Path, damage: bytes) -> None:
+    """A model whose second opinion cannot be read is a prerequisite that is missing, with its path."""
+    other = tmp_path / "model"
+    other.mkdir()
+    for file in folder.iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    (other / FILE).write_bytes(damage)
+    tier = LocalTier(LlmConfig(tiers=("local",), local_model=str(other)), CATALOGUE)
+    await tier.start()
+    try:
+        with pytest.raises(PrerequisiteError, match=r"evidence\.bin"):
+            await tier.propose(PlanContext(instruction="go home", robots=ROBOTS))
+    finally:
+        await tier.close()
 
 
 def test_a_generator_that_was_set_back_says_the_same(folder: Path) -> None:

@@ -61,6 +61,8 @@ def model_card(
             "- **Data**: the hand-written pairs of `appliance/llm/corpus`, varied while training, and in a tuned one",
             "  a site's own. Neither the shared development cases nor any other test data.",
             f"- **Training**: {figures.get('step', '?')} steps; {settings}.",
+            "- **Second opinion** (`evidence.bin`): a linear classifier of the skills that words speak for, trained on",
+            "  the same pairs; it has a say in which of several answers is given.",
             "- **Limits**: English only; 256 words with the roster; names only as they are said; no task that has",
             "  begun is continued. What it plans is checked by the validator and the safety policy in any case.",
             "",

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.llm.language.codec import read
+from appliance.llm.language.evidence import write_evidence
 from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import words_of
 from appliance.llm.slot import Slot
@@ -26,6 +27,7 @@ from appliance.llm.speaking import Question
 from appliance.llm.train.card import card_of, model_card, write_card
 from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.ending import ended
+from appliance.llm.train.evidence import learn
 from appliance.llm.train.examples import Example
 from appliance.llm.train.judge import is_exact
 from appliance.llm.train.splits import split
@@ -69,6 +71,7 @@ def export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -
         subprocess.run([*command, *(["--extra_options", *options] if options else [])], check=True)
     write_card(folder, card_of(tokens, catalogue))
     parts = split(corpus_examples(catalogue))
+    write_evidence(folder, learn(parts.train, catalogue))
     held_out = [*parts.structure, *parts.vocabulary, *parts.chance]
     held_out = held_out[:: max(1, len(held_out) // most)] if most else held_out
     slope, offset, curve = calibrate(folder, held_out, catalogue)
