@@ -11,6 +11,7 @@ from collections.abc import Iterable
 
 from appliance.llm.language.values import figures
 from appliance.llm.safety.checks import robots_of
+from appliance.llm.sense import NUMBERS
 from appliance.llm.settings import PlanContext
 from appliance.llm.validate import is_unnamed, shown
 from appliance.model import Plan
@@ -66,7 +67,9 @@ def _said(context: PlanContext) -> set[str]:
     if context.so_far is not None:
         for step in context.so_far.steps:
             texts += [str(each) for each in step.params.values()]
-    return {word for text in texts for word in _words(text)}
+    words = {word for text in texts for word in _words(text)}
+    # Word by word too: "gauges two four and six" are no 24, and "glass one," is glass 1.
+    return words | {NUMBERS[word] for word in words & NUMBERS.keys()}
 
 
 def _words(text: str) -> Iterable[str]:
