@@ -21,8 +21,9 @@ from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError
 from appliance.llm.analysis import Analysis, analyse
 from appliance.llm.experience.memory import Memory
 from appliance.llm.figures import Figures
-from appliance.llm.intake import explained, refused
+from appliance.llm.intake import explained, no_plan, refused
 from appliance.llm.peers import ProposeAsk, Proposed
+from appliance.llm.routing.agreement import after_resort
 from appliance.llm.routing.budget import Budget
 from appliance.llm.routing.canonical import catalogue_digest, digest, plan_key
 from appliance.llm.routing.gate import Gate
@@ -330,7 +331,13 @@ class Decomposer:
             if answered:
                 proposed.add(slot.planner.name)
             if attempt.ok and proposal is not None:
-                return _stamped(proposal, attempts, len(attempts) - 1)
+                sure = None if best is None else after_resort(best[0].plan, attempts[best[1]].confidence, proposal)
+                if best is None or sure is None:
+                    return _stamped(proposal, attempts, len(attempts) - 1)
+                attempts[best[1]] = msgspec.structs.replace(attempts[best[1]], confidence=sure)
+                why = f"the plan of {attempts[best[1]].tier} is taken: {sure:.2f} sure with this one beside it"
+                attempts[-1] = msgspec.structs.replace(attempt, ok=False, problems=(why, *attempt.problems))
+                continue
             self._figures.failed(tier)
             # A proposal that comes back is valid: here it was only not sure enough.
             usable = proposal is not None and slot.fallback and attempt.confidence >= self._config.floor_confidence
@@ -340,7 +347,7 @@ class Decomposer:
             proposal, index = best
             attempts[index] = msgspec.structs.replace(attempts[index], ok=True)
             return _stamped(proposal, attempts, index)
-        raise _refusal(attempts, explained(context.instruction))
+        raise no_plan(attempts, explained(context.instruction))
 
     async def _ask(self, slot: Slot, context: PlanContext, check: Check) -> tuple[Proposal | None, TierAttempt, bool]:
         """Ask one tier, with one repair; a proposal that is returned is valid. Last: whether it proposed anything."""
@@ -428,19 +435,6 @@ def _stamped(proposal: Proposal, attempts: Sequence[TierAttempt], index: int) ->
         provenance=None,
     )
     return _Found(plan=plan, attempts=tuple(attempts), model=proposal.model, gateway=proposal.gateway)
-
-
-def _refusal(attempts: Sequence[TierAttempt], why: str) -> PlanError:
-    if not attempts:
-        return PlanError("no planner is configured", remedy='set llm.tiers; "rules" needs nothing else')
-    problems = [f"{each.tier}: {problem}" for each in attempts for problem in each.problems]
-    # The last tier asked is the one of last resort: its problems are the most telling.
-    last = attempts[-1].problems or ("no plan",)
-    return PlanError(
-        f"no valid plan for the instruction: {'; '.join((why, *last[:3]) if why else last[:3])}",
-        remedy='mend that, or use plain orders such as "Robot_1: go to goal 2, then photograph the shelf"',
-        problems=tuple(problems[:MAX_PROBLEMS]),
-    )
 
 
 @contextlib.asynccontextmanager

@@ -8,8 +8,11 @@ doubtful is left to the planners.
 import json
 import re
 import unicodedata
+from collections.abc import Sequence
 
 from appliance.errors import PlanError
+from appliance.llm.validate import MAX_PROBLEMS
+from appliance.model import TierAttempt
 
 MAX_CHARACTERS = 4000
 """Longer text is no instruction; the gateway's own bound (`tasks.max_instruction_chars`) is lower."""
@@ -75,6 +78,20 @@ def explained(instruction: str) -> str:
     if text.endswith("?") or _QUESTION.match(text):
         return "it is a question, and says nothing that a robot shall do"
     return ""
+
+
+def no_plan(attempts: Sequence[TierAttempt], why: str) -> PlanError:
+    """Return the error for an instruction that no tier had a plan for: what each lacked, and how to say it."""
+    if not attempts:
+        return PlanError("no planner is configured", remedy='set llm.tiers; "rules" needs nothing else')
+    problems = [f"{each.tier}: {problem}" for each in attempts for problem in each.problems]
+    # The last tier asked is the one of last resort: its problems are the most telling.
+    last = attempts[-1].problems or ("no plan",)
+    return PlanError(
+        f"no valid plan for the instruction: {'; '.join((why, *last[:3]) if why else last[:3])}",
+        remedy='mend that, or use plain orders such as "Robot_1: go to goal 2, then photograph the shelf"',
+        problems=tuple(problems[:MAX_PROBLEMS]),
+    )
 
 
 def _not_text(text: str) -> PlanError | None:

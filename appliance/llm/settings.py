@@ -93,8 +93,9 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     rules_deadline_s: float = 5.0
     """The parser needs milliseconds; the bound is for hostile text."""
-    rules_min_confidence: float = 0.8
-    """Share of the instruction the parser must have understood: half an instruction carried out is a wrong one."""
+    rules_min_confidence: float = 0.97
+    """Share of the instruction the parser must have understood: half an instruction carried out is a wrong one. Of the
+    held-out instructions with 0.8 to 0.97 one plan in nine was right."""
 
     floor_confidence: float = 0.1
     """A valid plan that no tier was sure enough of is still taken, when nothing better came, down to this; below

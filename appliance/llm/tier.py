@@ -20,6 +20,9 @@ class Proposal(Struct, frozen=True, kw_only=True):
     plan: Plan
     confidence: float
     problems: tuple[str, ...] = ()
+    likely: float | None = None
+    """How likely it is right, 0 to 1, where `confidence` says something else: the rules' is the share of the words
+    that they understood. None: as likely as its confidence says."""
     model: str = ""
     """The model that wrote it; empty for rules."""
     gateway: str = ""

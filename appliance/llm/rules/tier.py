@@ -5,6 +5,7 @@ import asyncio
 from appliance.errors import PlanError
 from appliance.llm.rules.domains import domain_of
 from appliance.llm.rules.mending import mend
+from appliance.llm.rules.odds import odds_right
 from appliance.llm.rules.parser import Parser, Reading
 from appliance.llm.settings import PlanContext
 from appliance.llm.tier import Proposal
@@ -62,7 +63,8 @@ class RulesTier:
                 problems=lost,
                 remedy='use plain orders, such as "Robot_1: go to goal 2, then photograph the shelf"',
             )
-        return Proposal(plan=plan, confidence=reading.confidence, problems=lost)
+        likely = odds_right(reading.confidence, words=len(context.instruction.split()), subtasks=len(plan.subtasks))
+        return Proposal(plan=plan, confidence=reading.confidence, likely=likely, problems=lost)
 
     async def close(self) -> None:
         """Nothing to release."""
