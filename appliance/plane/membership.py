@@ -30,7 +30,8 @@ class Membership:
         self._session = session
         self._gateway = gateway
         self._members: frozenset[str] = frozenset() if gateway is None else frozenset({gateway})
-        self._ring = Ring(self._members, virtual_nodes=virtual_nodes)
+        self._made = self._members, Ring(self._members, virtual_nodes=virtual_nodes)
+        """The members that the ring was last made of, and it; replaced whole, by Zenoh's threads too."""
         self.on_joined: list[Callable[[str], None]] = []
         self.on_lost: list[Callable[[str], None]] = []
         self._tokens: dict[str, set[str]] = {}
@@ -49,11 +50,15 @@ class Membership:
 
     @property
     def ring(self) -> Ring:
-        """The ring of the members; made when it is asked for, so that a burst of news makes it once."""
-        if self._ring.members is not self._members:
-            self._ring = self._ring.changed_to(self._members)
-            self._members = self._ring.members
-        return self._ring
+        """The ring of the members; made when it is asked for, so that a burst of news makes it once.
+
+        Reads are answered on Zenoh's threads, which ask for it as well: the members are the event loop's alone to change.
+        """
+        members, (made_of, ring) = self._members, self._made
+        if made_of is not members:
+            ring = ring.changed_to(members)
+            self._made = members, ring
+        return ring
 
     def sees(self, name: str) -> bool:
         """Whether a gateway counts as there for its questions about records."""
