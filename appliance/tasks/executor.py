@@ -138,6 +138,7 @@ class Executor:
         received_ns = time.monotonic_ns()
         decision = self.reserved(request) or await self._choosing.choose(request)
         if isinstance(decision, RunAccepted):
+            self._sent_on(request, decision)
             return decision
         if request.hops and decision.phase is Phase.COLD and not (request.anew and self._pool.has_room(request.need)):
             what = "room for a new container" if request.anew else f"ready container of {request.need.image}"
@@ -168,6 +169,26 @@ class Executor:
         task.add_done_callback(lambda done: self._ended(run_id, done))
         self.on_change()
         return accepted
+
+    def _sent_on(self, request: RunRequest, accepted: RunAccepted) -> None:
+        """Note where a run went that never began here: this gateway is asked after it until its record names the other.
+
+        Whoever asks may be a coordinator that took over just now; told that nobody knows of the run, it would begin the
+        next attempt beside it. The same order again has the same answer.
+        """
+        run_id = request.run_id
+        self._accepted[run_id] = accepted
+        self._passing.moved[run_id] = accepted.gateway
+        event = RunEvent(
+            task=request.task,
+            subtask=request.subtask,
+            attempt=request.attempt,
+            kind=RunEventKind.PROGRESS,
+            gateway=accepted.gateway,
+            phase=accepted.phase,
+        )
+        self._remember(run_id, event)
+        self._later(self._kept.keep(run_id, event))
 
     def _check(self, request: RunRequest) -> None:
         """Refuse what must not begin (any more)."""

@@ -34,7 +34,7 @@ from appliance.model import (
     encode,
 )
 from appliance.pool.selection import Decision
-from appliance.tasks.api import RunAsk
+from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.checkpoints import read_checkpoint
 from appliance.tasks.executor import Executor
 from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
@@ -137,6 +137,38 @@ async def test_an_order_is_passed_on_once(executor: Executor, plane: Any, pool: 
     pool.decision = Decision(phase=Phase.COLD, gateway="gw-1")
     with pytest.raises(RefusedError, match="no ready container"):
         await executor.run(replace(REQUEST, subtask="s2", hops=1))
+
+
+async def test_whoever_asks_after_a_run_that_was_passed_on_learns_where_it_is(
+    executor: Executor, plane: Any, pool: Any, tasks_config: Any
+) -> None:
+    """A coordinator that has taken over knows only whom the order went to, which has not to say that there is no run.
+
+    The same order begins nothing in a second place, a cancel goes on to where it runs, over a restart too, and the end
+    of the task ends the remembering.
+    """
+
+    async def take(gateway: str, request: RunRequest) -> RunAccepted:
+        return RunAccepted(gateway=gateway, container="c2", phase=Phase.REMOTE_WARM)
+
+    async def answer(gateway: str, ask: RunAsk) -> RunStatus:
+        return RunStatus(running=(gateway, ask) == ("gw-2", ASK))
+
+    plane.rpc.on.update(run=take, run_status=answer, run_cancel=answer)
+    pool.decisions = [AWAY]
+    assert await executor.run(REQUEST) == await executor.run(REQUEST)
+    assert [verb for _, verb, _ in plane.rpc.calls] == ["run"]
+    assert (await executor.status(ASK)).running
+    await executor.cancel(ASK)
+    assert plane.rpc.calls[-1] == ("gw-2", "run_cancel", ASK)
+    await until(lambda: plane.store.values)
+    again = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    await again.start()
+    assert (await again.status(ASK)).running
+    plane.session.put(plane.keys.task("t-1"), encode(replace(plane.accepted(), state=TaskState.CANCELLED)))
+    await until(lambda: not plane.store.values)
+    assert await again.status(ASK) == await executor.status(ASK) == RunStatus(running=False)
+
 
 
 @pytest.mark.parametrize("error", [DeadlineError("no answer"), UnreachableError("it went away", sent=True)])
