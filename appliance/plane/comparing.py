@@ -18,7 +18,7 @@ from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.plane.versions import Record, check_record, summary
+from appliance.plane.versions import MAX_KEY, Record, check_record, summary
 
 log = structlog.get_logger(__name__)
 
@@ -180,25 +180,34 @@ class Comparing:
                 return fetched
             wanted = [key for key, each in answer.digests.items() if mine.get(key) != each]
             fetched += await self._fetch(member, wanted)
-            if not answer.more or not answer.digests:
+            # One that never comes to its end must not hold up the others' records.
+            if not answer.more or (last := max(answer.digests, default="")) <= asked.after:
                 return fetched
-            asked = DigestAsk(asker=self._gateway, after=max(answer.digests), joining=joining)
+            asked = DigestAsk(asker=self._gateway, after=last, joining=joining)
 
     async def _fetch(self, member: str, keys: list[str]) -> int:
         done = 0
         while keys:
             page = keys[:_PAGE]
             answer = await self._rpc.call(member, "dht_fetch", FetchAsk(tuple(page)), FetchList, timeout_s=ASK_S)
-            for record in answer.records:
-                check_record(record, max_bytes=self._config.max_record_bytes)
-            await asyncio.gather(*(self._keep(record) for record in answer.records))
-            done += len(answer.records)
+            good = [record for record in answer.records if self._may_keep(record, member)]
+            await asyncio.gather(*(self._keep(record) for record in good))
+            done += len(good)
             if answer.more and answer.records:
                 last = answer.records[-1].key
                 keys = keys[page.index(last) + 1 :] if last in page else []
             else:
                 keys = keys[len(page) :]
         return done
+
+    def _may_keep(self, record: Record, member: str) -> bool:
+        """Whether a record from elsewhere may be stored; one that may not is counted, and the others are taken."""
+        try:
+            check_record(record, max_bytes=self._config.max_record_bytes)
+        except PayloadError as error:
+            self._rpc.refuse("record of a member", member=member, key=record.key[:MAX_KEY], reason=str(error))
+            return False
+        return True
 
     # --- answering --------------------------------------------------------------------------------------------
 

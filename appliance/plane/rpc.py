@@ -50,6 +50,8 @@ class Rpc:
     """Serves one gateway's verbs and calls those of others; a client (`gateway` None) only calls."""
 
     def __init__(self, session: Session, gateway: str | None) -> None:
+        self.refuse = session.refuse
+        """Counts bad input of those that are asked or ask."""
         self._session = session
         self._gateway = gateway
         self._verbs: dict[str, Callable[[bytes], Awaitable[bytes]]] = {}

@@ -37,6 +37,8 @@ class Retention:
     def __init__(self, plane: Plane, config: TasksConfig) -> None:
         self._plane = plane
         self._config = config
+        self._after: dict[str, str] = {}
+        """Prefix -> the key up to which was looked, where there was more than a round may look up."""
 
     async def run(self) -> None:
         """Look through the shard now and then."""
@@ -79,19 +81,22 @@ class Retention:
     async def _orphaned(self, prefix: str, *, ended: bool) -> list[Record]:
         """Records whose task (the second part of their key) is gone, or `ended`.
 
-        A task that runs is never gone, so what belongs to it stays.
+        A task that runs is never gone, so what belongs to it stays. What a round does not come to is the next one's.
         """
         owned = await self._owned(prefix)
         orphaned: list[Record] = []
         needed: dict[str, bool] = {}
-        for key, stored in owned.items():
+        after, last = self._after.pop(prefix, ""), ""
+        for key in sorted(key for key in owned if key > after):
             task = key.split("/")[1]
             if task not in needed:
                 if len(needed) >= AT_ONCE:
+                    self._after[prefix] = last
                     break
                 needed[task] = await self._needed(task, ended=ended)
             if not needed[task]:
-                orphaned.append(stored)
+                orphaned.append(owned[key])
+            last = key
         return orphaned
 
     async def _needed(self, task: str, *, ended: bool) -> bool:

@@ -12,7 +12,7 @@ from appliance.errors import UnreachableError
 from appliance.model import TaskRecord, TaskState
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
-from appliance.tasks.retention import Retention, surplus
+from appliance.tasks.retention import AT_ONCE, Retention, surplus
 from appliance.tasks.settings import TasksConfig
 
 pytestmark = pytest.mark.anyio
@@ -104,3 +104,16 @@ async def test_what_belongs_to_a_task_that_cannot_be_looked_up_stays() -> None:
     plane = cast("Plane", SimpleNamespace(dht=records))
     assert await Retention(plane, TasksConfig()).round() == 2
     assert sorted(records.kept) == ["checkpoint/away/s1", "effect/away/s1/1"]
+
+
+async def test_many_tasks_that_are_kept_do_not_hide_what_is_left_over_behind_them() -> None:
+    """More than a round looks up: the next goes on from there, and then begins anew."""
+    records = Records()
+    for number in range(AT_ONCE + 10):
+        records.task(f"a{number:04}", TaskState.RUNNING, 0)
+        records.put(f"effect/a{number:04}/s1/1")
+    records.put("effect/gone/s1/1")
+    retention = Retention(cast("Plane", SimpleNamespace(dht=records)), TasksConfig())
+    assert [await retention.round() for _ in range(2)] == [0, 1]
+    records.put("effect/a/s1/1")
+    assert [await retention.round() for _ in range(2)] == [1, 0]
