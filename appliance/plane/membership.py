@@ -52,7 +52,7 @@ class Membership:
     def ring(self) -> Ring:
         """The ring of the members; made when it is asked for, so that a burst of news makes it once.
 
-        Reads are answered on Zenoh's threads, which ask for it as well: the members are the event loop's alone to change.
+        Reads are answered on Zenoh's threads, which ask for it as well; only the event loop changes the members.
         """
         members, (made_of, ring) = self._members, self._made
         if made_of is not members:

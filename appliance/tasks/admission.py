@@ -1,9 +1,11 @@
 """Whether a task is taken: what is wrong with a request, when to come back, and what one that is taken must expect."""
 
+import contextlib
 import math
+import time
 import uuid
-from collections import deque
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Mapping
 
 from msgspec.structs import replace
 
@@ -69,6 +71,36 @@ class Ends:
         """Seconds until so many more tasks will have ended; 0: not known."""
         rate = self.rate(now)
         return min(LONGEST_RETRY_S, round(ends / rate, 1)) if rate else 0.0
+
+
+class Admission:
+    """Keeps the tasks of one gateway within their bound, those among them whose first record is only being written."""
+
+    def __init__(self, gateway: str, most: int) -> None:
+        self.ends = Ends()
+        self._gateway = gateway
+        self._most = most
+        self._coming: Counter[str] = Counter()
+        """As often as each is being asked for at this moment."""
+
+    @contextlib.contextmanager
+    def one_more(self, task: str, driven: Collection[str]) -> Iterator[None]:
+        """Count a task in while it is being accepted; `driven`: those that were.
+
+        Raises:
+            RefusedError: the gateway has as many as it may have.
+        """
+        unfinished = len({*driven, *self._coming})
+        over = unfinished + 1 - self._most
+        if over > 0 and task not in self._coming:
+            raise full(self._gateway, unfinished, self.ends.retry_after_s(over, time.monotonic()))
+        self._coming[task] += 1
+        try:
+            yield
+        finally:
+            self._coming[task] -= 1
+            if not self._coming[task]:
+                del self._coming[task]
 
 
 def full(gateway: str, unfinished: int, retry_after_s: float) -> RefusedError:

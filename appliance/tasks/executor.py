@@ -36,7 +36,7 @@ from appliance.tasks.checkpoints import Checkpoints
 from appliance.tasks.choosing import Choosing
 from appliance.tasks.elsewhere import Elsewhere
 from appliance.tasks.kept_runs import KeptRuns
-from appliance.tasks.passing import PassedOn, Passing
+from appliance.tasks.passing import PassedOn, Passing, whereabouts
 from appliance.tasks.remote import RemoteContainers
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.surroundings import task_key
@@ -154,15 +154,7 @@ class Executor:
             choice=decision.choice,
         )
         self._accepted[run_id] = accepted
-        begun = RunEvent(
-            task=request.task,
-            subtask=request.subtask,
-            attempt=request.attempt,
-            kind=RunEventKind.PROGRESS,
-            gateway=self._plane.gateway,
-            phase=phase,
-        )
-        self._remember(run_id, begun)
+        self._remember(run_id, whereabouts(request, accepted))
         task = asyncio.create_task(self._carry_out(request, decision, received_ns), name=f"run {run_id}")
         self._running[run_id] = task
         self._here[run_id] = Here(request, time.monotonic())
@@ -176,17 +168,9 @@ class Executor:
         Whoever asks may be a coordinator that took over just now; told that nobody knows of the run, it would begin the
         next attempt beside it. The same order again has the same answer.
         """
-        run_id = request.run_id
+        run_id, event = request.run_id, whereabouts(request, accepted)
         self._accepted[run_id] = accepted
         self._passing.moved[run_id] = accepted.gateway
-        event = RunEvent(
-            task=request.task,
-            subtask=request.subtask,
-            attempt=request.attempt,
-            kind=RunEventKind.PROGRESS,
-            gateway=accepted.gateway,
-            phase=accepted.phase,
-        )
         self._remember(run_id, event)
         self._later(self._kept.keep(run_id, event))
 

@@ -39,7 +39,7 @@ from appliance.model import (
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
-from appliance.tasks.admission import Ends, checked, expectation, full, longest_s
+from appliance.tasks.admission import Admission, checked, expectation, longest_s
 from appliance.tasks.api import (
     ExperienceAsk,
     ExperienceList,
@@ -100,7 +100,7 @@ class TaskManager:
         self._executor = executor
         self._site = site
         self._ages = Ages()
-        self._ends = Ends()
+        self._admission = Admission(plane.gateway, config.max_tasks)
         self._driving = Driving(self, ages=self._ages, moved=self._moved, ended=self._has_ended, changed=self._tell)
         self._drivers, self._sweep = self._driving.drivers, self._driving.sweep
         self.scheduler = Scheduler(
@@ -201,7 +201,7 @@ class TaskManager:
             RefusedError: the coordinator is full.
             UnreachableError: no owner could be reached within the time allowed.
         """
-        request = self._check(request)
+        request = checked(request, self.config)
         until = time.monotonic() + 5.0
         while True:
             owner = ""
@@ -218,15 +218,15 @@ class TaskManager:
                 continue
             return await self.accept(request)
 
-    def _check(self, request: TaskRequest) -> TaskRequest:
-        return checked(request, self.config)
-
     async def accept(self, request: TaskRequest) -> TaskRecord:
         """Write the record, here and on the replicas, then drive it."""
-        request = self._check(request)
-        over = len(self._drivers) + 1 - self.config.max_tasks
-        if over > 0:
-            raise full(self.plane.gateway, len(self._drivers), self._ends.retry_after_s(over, time.monotonic()))
+        request = checked(request, self.config)
+        if request.id in self._drivers:
+            return await self.task(TaskAsk(id=request.id))  # asked again, however full it is
+        with self._admission.one_more(request.id, self._drivers):
+            return await self._take(request)
+
+    async def _take(self, request: TaskRequest) -> TaskRecord:
         transition = Transition(
             task=request.id,
             sequence=1,
@@ -268,7 +268,7 @@ class TaskManager:
     def _has_ended(self, driver: Driver) -> None:
         self.scheduler.forget(driver.record.id)
         if driver.ended:
-            self._ends.ended(time.monotonic())
+            self._admission.ends.ended(time.monotonic())
 
     def _on_run_event(self, key: str, event: RunEvent | None) -> None:
         if event is None or (driver := self._drivers.get(event.task)) is None:
@@ -351,7 +351,7 @@ class TaskManager:
 
     async def plan_only(self, ask: PlanAsk) -> PlanAnswer:
         """Decompose an instruction against the present roster and site; run nothing."""
-        instruction = self._check(TaskRequest(instruction=ask.instruction)).instruction
+        instruction = checked(TaskRequest(instruction=ask.instruction), self.config).instruction
         context = self._context(instruction, private=ask.private)
         outcome = await self._decomposer.plan(context)
         analysis = self._decomposer.analyse(context, outcome.plan)

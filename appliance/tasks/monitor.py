@@ -39,13 +39,15 @@ class Monitor:
         self._began: dict[tuple[str, int], float] = {}
 
     def seen(self, event: RunEvent) -> None:
-        """Note a sign of life of a run; whatever it tells is one."""
+        """Note a sign of life of a run; whatever it tells is one. Of attempts that nobody ordered nothing is kept."""
         run = (event.subtask, event.attempt)
         now = time.monotonic()
+        target = next((each for each in self._keeper.record.subtasks if each.subtask.id == event.subtask), None)
+        if target is None or target.attempt != event.attempt:
+            return
         if event.kind is RunEventKind.STARTED:
             self._began.setdefault(run, now)
-        if run in self._heard or any(each.subtask.id == event.subtask for each in self._keeper.record.subtasks):
-            self._heard[run] = now
+        self._heard[run] = now
 
     def look(self, target: SubtaskRecord, silent_s: float | None) -> None:
         """Judge a run that is under way, and do what follows.

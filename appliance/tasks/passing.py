@@ -127,18 +127,7 @@ class Passing:
         choice = accepted.choice and replace(
             accepted.choice, by=self._plane.gateway, way=Way.NEW if offer.anew else Way.RUN_THERE, why=why
         )
-        return PassedOn(
-            RunEvent(
-                task=request.task,
-                subtask=request.subtask,
-                attempt=request.attempt,
-                kind=RunEventKind.PROGRESS,
-                gateway=accepted.gateway,
-                phase=accepted.phase,
-                note=clean(why, MAX_NOTE),
-                choice=choice,
-            )
-        )
+        return PassedOn(replace(whereabouts(request, accepted), note=clean(why, MAX_NOTE), choice=choice))
 
     async def ask(self, run_id: str, verb: str) -> RunStatus:
         """Ask after a run that was passed on (`run_status`), or have it ended (`run_cancel`), where it is."""
@@ -149,6 +138,18 @@ class Passing:
         except SwiftbotError as error:
             log.info("no word of a run that was passed on", run=run_id, gateway=there, reason=str(error))
             return RunStatus(running=there in self._plane.members())
+
+
+def whereabouts(request: RunRequest, accepted: RunAccepted) -> RunEvent:
+    """What is told of a run that was accepted: where it is."""
+    return RunEvent(
+        task=request.task,
+        subtask=request.subtask,
+        attempt=request.attempt,
+        kind=RunEventKind.PROGRESS,
+        gateway=accepted.gateway,
+        phase=accepted.phase,
+    )
 
 
 def may_run(error: SwiftbotError) -> bool:

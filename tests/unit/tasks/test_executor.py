@@ -170,7 +170,6 @@ async def test_whoever_asks_after_a_run_that_was_passed_on_learns_where_it_is(
     assert await again.status(ASK) == await executor.status(ASK) == RunStatus(running=False)
 
 
-
 @pytest.mark.parametrize("error", [DeadlineError("no answer"), UnreachableError("it went away", sent=True)])
 async def test_a_pass_on_without_an_answer_is_not_run_here_as_well(
     executor: Executor, plane: Any, pool: Any, error: SwiftbotError

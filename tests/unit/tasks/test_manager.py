@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.client import _news
-from appliance.errors import DeadlineError, PayloadError, UnreachableError
+from appliance.errors import DeadlineError, PayloadError, RefusedError, UnreachableError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.experience.statistic import Experience
 from appliance.llm.safety.settings import SafetyConfig
@@ -202,6 +202,20 @@ async def test_fields_of_a_later_version_stay_in_the_record(manager: TaskManager
     manager._sweep.set()
     await until(lambda: "subtasks" in msgspec.json.decode(plane.dht.records["task/t-1"].value))
     assert msgspec.json.decode(plane.dht.records["task/t-1"].value)["colour"] == {"of": "later"}
+
+
+async def test_a_flood_of_tasks_does_not_get_past_the_bound_while_records_are_written(
+    manager: TaskManager, plane: Any
+) -> None:
+    """Those that are only being written count as well; whoever asks again for a task that was taken is told of it."""
+    most = manager.config.max_tasks
+    wishes = [manager.submit(wish(plane, f"t-{number}")) for number in range(most + 20)]
+    answers = await asyncio.gather(*wishes, return_exceptions=True)
+    assert sum(isinstance(each, RefusedError) for each in answers) == 20
+    assert manager.unfinished == most
+    assert (await manager.submit(wish(plane, "t-0"))).id == "t-0"
+    with pytest.raises(RefusedError, match=str(most)):
+        await manager.submit(wish(plane, "t-new"))
 
 
 async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, plane: Any) -> None:

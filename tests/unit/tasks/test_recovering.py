@@ -294,6 +294,17 @@ async def test_signs_of_life_keep_a_run_going(bench: Any) -> None:
     assert [each.number for each in ended.of("s1").attempts] == [1]
 
 
+async def test_nothing_is_kept_of_attempts_that_nobody_ordered(bench: Any) -> None:
+    """However many somebody tells of: the record says which attempt is the present one."""
+    driver = await bench.start()
+    _, request = await bench.ordered()
+    for attempt in range(2, 300):
+        for subtask in ("s1", "nobody"):
+            bench.tell(replace(request, subtask=subtask, attempt=attempt), STARTED)
+    bench.tell(request, STARTED)
+    assert list(driver._monitor._heard) == list(driver._monitor._began) == [("s1", 1)]
+
+
 async def test_its_own_gateways_word_that_a_run_is_alive_counts(bench: Any) -> None:
     """Events that are lost on the way do not make a run stuck: its gateway is asked before."""
 
