@@ -156,9 +156,10 @@ class Dht:
                     found = await self._rpc.call(
                         gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S, direct=True
                     )
-            except (UnreachableError, DeadlineError, RefusedError) as error:
+            except SwiftbotError as error:
+                # Away, late, or with a disk that fails: the others have copies.
                 problems[gateway] = str(error)
-                apart = apart or (gateway == owner and not isinstance(error, DeadlineError))
+                apart = apart or (gateway == owner and isinstance(error, UnreachableError | RefusedError))
                 continue
             if found.record is not None or not found.unsure:
                 return found, False

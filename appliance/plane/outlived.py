@@ -83,6 +83,8 @@ class Outlived:
         # After less than a lease the others may not have closed their links at all.
         if standstill.lasted_s < self._lease_s or self._now() < self._not_before:
             return
+        if self._looking is not None and not self._looking.done():
+            return  # with long leases a look lasts longer than the rest after it
         self._not_before = self._now() + REST_S
         self._looking = asyncio.create_task(self._look(standstill.since), name="links after a standstill")
 

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.errors import ConflictError, DeadlineError, UnreachableError
+from appliance.errors import ConflictError, DeadlineError, PrerequisiteError, UnreachableError
 from appliance.plane import dht, reconcile
 from appliance.plane.messages import Found, KeyAsk, RecordAsk
 from appliance.plane.node import Plane
@@ -91,6 +91,27 @@ async def test_a_replica_without_a_copy_does_not_speak_for_its_owner(
     # A replica that has a copy answers for it.
     await only_at(planes[3], key)
     assert await asker.dht.read(key, replica=replica) is not None
+
+
+@pytest.mark.parametrize("asker", [0, 1])
+async def test_an_owner_whose_disk_fails_keeps_nobody_from_the_other_copies(
+    planes: list[Plane], monkeypatch: pytest.MonkeyPatch, asker: int
+) -> None:
+    """Its own reads and those of others find them; what it alone could say is not known."""
+    key = key_of(planes[0], "g1", "g2", "g3")
+    absent = key_of(planes[0], "g1", other_than=key)
+    await planes[0].dht.write(key, b"v", expected=None)
+
+    async def broken(_: str) -> None:
+        raise PrerequisiteError("the disk fails")
+
+    monkeypatch.setattr(planes[1].store, "look", lambda _: (False, None))
+    monkeypatch.setattr(planes[1].store, "record", broken)
+    found = await planes[asker].dht.read(key)
+    assert found is not None
+    assert found.value == b"v"
+    with pytest.raises(UnreachableError, match="the disk fails"):
+        await planes[asker].dht.read(absent)
 
 
 @pytest.mark.parametrize("replica", [False, True])

@@ -135,6 +135,33 @@ async def test_one_that_answers_or_has_gone_meanwhile_is_well() -> None:
     assert (bench.asked, bench.renewed) == (["gw-3", "gw-4"], [])
 
 
+async def test_a_look_that_is_under_way_is_not_begun_again() -> None:
+    """With long leases it lasts longer than the rest after it; there is one at a time, which the end gives up."""
+    bench = Bench(("gw-2", 5.0))
+    asked, goes_on = asyncio.Event(), asyncio.Event()
+
+    async def slow(name: str, timeout_s: float) -> bool:
+        asked.set()
+        await goes_on.wait()
+        return await bench.answers(name, timeout_s)
+
+    outlived = Outlived(
+        cast("Pulse", bench), lease_s=LEASE_S, members=bench, answers=slow, renew=bench.renewed.append,
+        now=lambda: bench.now, pause=bench.pause,
+    )  # fmt: skip
+    tell = bench.on_stalled[-1]
+    bench.now = 20.0
+    tell(Standstill(10.0, 1.1))
+    await asked.wait()
+    asked.clear()
+    bench.now = 20.0 + 2 * REST_S
+    tell(Standstill(bench.now, 1.1))
+    goes_on.set()
+    await asyncio.gather(*(each for each in asyncio.all_tasks() if each.get_name() == "links after a standstill"))
+    assert len(bench.asked) == len(bench.renewed) == 1
+    await outlived.close()
+
+
 async def test_a_large_fleet_is_counted_whole() -> None:
     """Only so many are asked, but with 40 that nobody lost one that is slow breaks no link; with one lost it does."""
     bench = Bench(*((f"gw-{number:02}", 5.0) for number in range(2, 42)))
