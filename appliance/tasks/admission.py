@@ -5,7 +5,7 @@ import math
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Generator, Mapping
 
 from msgspec.structs import replace
 
@@ -84,7 +84,7 @@ class Admission:
         """As often as each is being asked for at this moment."""
 
     @contextlib.contextmanager
-    def one_more(self, task: str, driven: Collection[str]) -> Iterator[None]:
+    def one_more(self, task: str, driven: Collection[str]) -> Generator[None]:
         """Count a task in while it is being accepted; `driven`: those that were.
 
         Raises:
