@@ -70,6 +70,8 @@ class View:
         self._distances: list[int] = []
         self._names: list[str] = []
         self._known: set[str] = set()
+        self._new: set[str] = set()
+        """Those heard of since the view was last trimmed."""
         # All members at distances in (0, _reach] and in [_back, RING_SIZE) are known.
         self._reach = 0
         self._back = RING_SIZE
@@ -246,8 +248,13 @@ class View:
         return new
 
     def trim(self, rng: random.Random) -> None:
-        """Keep `bound` members: the nearest both ways, the best fingers, and others at random."""
-        size = len(self._names)
+        """Keep `bound` members: the nearest both ways, the best fingers, and others at random.
+
+        Of these others who is known already stays: each that comes or goes is news for the rest of the plane, which
+        watches its token and asks for its facts.
+        """
+        size, new = len(self._names), self._new
+        self._new = set()
         if size <= self.bound:
             return
         after, before = self._kept()
@@ -257,7 +264,9 @@ class View:
             if index < size:
                 kept.add(index)
         rest = [index for index in range(size) if index not in kept]
-        kept.update(rng.sample(rest, min(len(rest), max(0, self.bound - len(kept)))))
+        for heard_now in (False, True):
+            some = [index for index in rest if (self._names[index] in new) is heard_now]
+            kept.update(rng.sample(some, min(len(some), max(0, self.bound - len(kept)))))
         # Beyond what is kept on purpose there may now be gaps.
         self._reach = self._distances[after - 1] if after else 0
         self._back = self._distances[size - before] if before else RING_SIZE
@@ -317,4 +326,5 @@ class View:
         self._distances.insert(index, distance)
         self._names.insert(index, name)
         self._known.add(name)
+        self._new.add(name)
         return True
