@@ -1,7 +1,6 @@
 """Work with a fleet: `swiftbot submit`, `task …`, `fleet`, `tui`."""
 
 import asyncio
-import os
 import signal
 import uuid
 from pathlib import Path
@@ -14,6 +13,7 @@ from cyclopts.validators import Number
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import Endpoint, FleetClient
+from appliance.connection import operator_name
 from appliance.console_watch import stream_line
 from appliance.errors import ConfigError, NotFoundError, PayloadError, SwiftbotError
 from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
@@ -60,7 +60,7 @@ def submit(
     request = TaskRequest(
         instruction=text,
         id=task_id or f"t-{uuid.uuid4().hex[:10]}",
-        submitter=_me(),
+        submitter=operator_name(),
         priority=priority,
         deadline_s=deadline,
         group=group,
@@ -106,10 +106,6 @@ def _outcome(record: TaskRecord) -> int:
     if record.state is TaskState.FAILED:
         return 4 if record.failure is not None and record.failure.code == "plan" else 1
     return 7 if record.state is TaskState.CANCELLED else 0
-
-
-def _me() -> str:
-    return os.environ.get("USER") or f"uid {os.getuid()}"
 
 
 @task_app.command(name="list")
@@ -304,6 +300,8 @@ def tui(
         _serve_tui(endpoint, port=port, options=options)
     else:
         plane = PlaneConfig(mode="client", connect=endpoint.connect)
+        if where.directory is not None:
+            own = msgspec.structs.replace(own, logs=(*own.logs, str(where.directory / "record")))
         asyncio.run(run_tui(plane, endpoint.fleet, own, replay=replay))
     return 0
 

@@ -153,9 +153,8 @@ def _by_streaming(path: Path) -> LogInfo:
             metadata = record.metadata
     problems = list(stream.problems)
     if not stream.finished and not problems:
-        problems.append(
-            f"the file was not finished; all whole chunks were read, {stream.lost_bytes} bytes at its end were not"
-        )
+        lost = f", {stream.lost_bytes} bytes at its end were not" if stream.lost_bytes else ""
+        problems.append(f"the file was not finished, or is still being written; all whole chunks were read{lost}")
     return LogInfo(
         path=str(path),
         size_bytes=path.stat().st_size,

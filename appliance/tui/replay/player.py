@@ -19,8 +19,8 @@ class Player:
         self.end_ns = max(start_ns, end_ns)
         self.rate = 1.0
         self.playing = False
-        self._at_ns = float(start_ns)
-        """The place at `_since`."""
+        self._into_ns = 0.0
+        """The place at `_since`, from the start: a float cannot tell a Unix nanosecond from the next hundred."""
         self._since = 0.0
 
     @property
@@ -30,14 +30,16 @@ class Player:
 
     def at_ns(self, now: float) -> int:
         """Return the moment that is shown; at the end it pauses."""
+        return self.start_ns + round(self._into(now))
+
+    def _into(self, now: float) -> float:
         if not self.playing:
-            return round(self._at_ns)
-        at = self._at_ns + max(0.0, now - self._since) * self.rate * 1e9
-        if at >= self.end_ns:
+            return self._into_ns
+        into = self._into_ns + max(0.0, now - self._since) * self.rate * 1e9
+        if into >= self.end_ns - self.start_ns:
             self.playing = False
-            self._at_ns = float(self.end_ns)
-            return self.end_ns
-        return round(at)
+            self._into_ns = into = float(self.end_ns - self.start_ns)
+        return into
 
     def at_s(self, now: float) -> float:
         """Return the same as seconds from the first message."""
@@ -46,8 +48,8 @@ class Player:
     def play(self, now: float) -> None:
         """Go on from where it is; at the end from the beginning."""
         self._settle(now)
-        if self._at_ns >= self.end_ns:
-            self._at_ns = float(self.start_ns)
+        if self._into_ns >= self.end_ns - self.start_ns:
+            self._into_ns = 0.0
         self.playing = True
 
     def pause(self, now: float) -> None:
@@ -60,7 +62,7 @@ class Player:
         if seconds != seconds:  # noqa: PLR0124 - not a number
             raise PayloadError("that is no time", remedy="give seconds from the start, such as 90, 1:30 or +10")
         self._settle(now)
-        self._at_ns = self.start_ns + min(max(0.0, seconds), self.length_s) * 1e9
+        self._into_ns = min(max(0.0, seconds), self.length_s) * 1e9
 
     def step(self, seconds: float, now: float) -> None:
         """Go so many seconds on, or back."""
@@ -88,11 +90,11 @@ class Player:
     def hold(self, at_ns: int, now: float) -> None:
         """Take it that messages could be read up to `at_ns` only: the clock waits for them."""
         if self.playing and self.at_ns(now) > at_ns:
-            self._at_ns = float(max(at_ns, self.start_ns))
+            self._into_ns = float(max(at_ns - self.start_ns, 0))
             self._since = now
 
     def _settle(self, now: float) -> None:
-        self._at_ns = float(self.at_ns(now))
+        self._into_ns = self._into(now)
         self._since = now
 
 

@@ -1,7 +1,11 @@
 """One real fleet for all tests of a module: starting one takes longer than what most of them do with it."""
 
+import asyncio
+import importlib.util
+import io
+import tarfile
 import textwrap
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -11,7 +15,9 @@ from moving_bench import write_skills
 from appliance.config import GatewayConfig
 from appliance.llm.settings import LlmConfig
 from appliance.local_fleet import FleetState
+from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
+from appliance.skills.catalogue import load_catalogue
 
 LAME = "lame"
 """An image that the fleet knows and that does not exist until a test makes it."""
@@ -54,3 +60,40 @@ async def fleet(lame: Path, tmp_path_factory: pytest.TempPathFactory) -> AsyncIt
         ),
     ) as state:
         yield state
+
+
+async def podman(*arguments: str) -> None:
+    """Run podman; fails with what it says."""
+    process = await asyncio.create_subprocess_exec(
+        "podman", *arguments, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+    )
+    said, _ = await process.communicate()
+    assert process.returncode == 0, said.decode()
+
+
+@pytest.fixture
+async def broken(lame: Path, tmp_path: Path) -> AsyncIterator[Callable[[], Awaitable[None]]]:
+    """Make an image of which no container starts; returns what mends it."""
+    catalogue = load_catalogue([lame.parent.parent])
+    mine, good = (reference(catalogue.images[name], PoolConfig()) for name in (LAME, "base"))
+    empty = tmp_path / "empty.tar"
+    with tarfile.open(empty, "w") as archive:
+        archive.addfile(tarfile.TarInfo("nothing"), io.BytesIO())
+    await podman("import", str(empty), mine)
+
+    async def mend() -> None:
+        await podman("tag", good, mine)
+
+    yield mend
+    await podman("rmi", "--force", "--ignore", mine)
+
+
+@pytest.fixture
+def toy(project_root: Path, tmp_path: Path) -> Path:
+    """Return the folder of a model that is small and knows nothing."""
+    spec = importlib.util.spec_from_file_location("tiny_model", project_root / "tests" / "tiny_model.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.build(tmp_path / "toy")

@@ -2,7 +2,7 @@
 
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from textual.pilot import Pilot
@@ -11,12 +11,62 @@ from appliance.local_fleet import FleetState
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.data import FleetView
+from appliance.tui.grammar import Command
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Store
 
 KEYS = {" ": "space", "-": "minus", "/": "slash", "_": "underscore", ".": "full_stop", "?": "question_mark"}
 LONG_S = 60.0
 """Nothing that is waited for here takes so long; the machine may be busy."""
+
+
+AUDITED = {
+    "approve": "approve", "reject": "reject", "cancel": "cancel", "pause": "pause", "hold": "pause", "resume": "resume",
+    "retry": "retry", "retry-subtask": "retry", "migrate": "migrate", "answer": "answer", "takeover": "control_take",
+    "give-back": "control_give", "stop": "soft_stop", "stop-robot": "soft_stop", "resume-robots": "soft_resume",
+    "resume-all": "soft_resume", "drain": "drain", "undrain": "undrain", "swap-model": "llm_swap", "warm": "pool_warm",
+    "evict": "pool_evict", "release": "pool_release_quarantine", "fetch": "image_fetch",
+}  # fmt: skip
+"""As what the audit has each action of the registry that is an order. Who submitted a task stands in its record."""
+
+T = TypeVar("T", bound=Callable[..., object])
+
+
+def does(*actions: str) -> Callable[[T], T]:
+    """Say which actions of the registry a test does against a real fleet; `watched` looks whether that is so."""
+
+    def marked(test: T) -> T:
+        test.__dict__["does"] = actions
+        return test
+
+    return marked
+
+
+class WatchedApp(SwiftbotApp):
+    """The terminal UI, which remembers what was begun and what was done with it."""
+
+    def __init__(self, view: FleetView, config: TuiConfig) -> None:
+        super().__init__(view, config)
+        self.begun: set[tuple[str, str]] = set()
+        """Actions, and why they were given."""
+        self.done: set[str] = set()
+        """Those that the fleet was asked for and did."""
+
+    def begin(self, command: Command) -> None:
+        """Remember it, unless it cannot begin."""
+        if not command.missing and (self.unlocked or command.action.always or not command.action.writes):
+            self.begun.add((command.action.name, command.given.get("why", "")))
+        super().begin(command)
+
+    def note(self, line: str, outcome: str, *, level: str = "info") -> None:
+        """Remember what came of it."""
+        if level == "info":
+            self.done.add(line.split(maxsplit=1)[0])
+        super().note(line, outcome, level=level)
+
+
+WATCHED: list[WatchedApp] = []
+"""The terminal UIs of the test that runs."""
 
 
 class Operator:
@@ -99,13 +149,14 @@ class Operator:
 
 @asynccontextmanager
 async def operator(
-    fleet: FleetState, name: str = "ann", *, size: tuple[int, int] = (120, 40)
+    fleet: FleetState, name: str = "ann", *, size: tuple[int, int] = (120, 40), logs: tuple[str, ...] = ()
 ) -> AsyncIterator[Operator]:
     """Open an unlocked terminal UI on a fleet, and wait until all of the fleet is on it."""
-    config = TuiConfig(refresh_hz=5.0, write=True)
+    config = TuiConfig(refresh_hz=5.0, write=True, logs=logs)
     view = FleetView(PlaneConfig(mode="client", connect=fleet.endpoint.connect), fleet.fleet, config)
     view.operator = name
-    app = SwiftbotApp(view, config)
+    app = WatchedApp(view, config)
+    WATCHED.append(app)
     async with app.run_test(size=size, notifications=True) as pilot:
         it = Operator(app, pilot)
         robots = set(fleet.robots)

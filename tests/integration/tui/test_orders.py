@@ -4,10 +4,8 @@ What came of it is asked of the fleet itself, by a client that has no part in th
 """
 
 import asyncio
-import importlib.util
-import io
-import tarfile
-from collections.abc import AsyncIterator, Callable
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -29,12 +27,13 @@ from appliance.model import (
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
+from appliance.tui.actions import BY_NAME
 from appliance.tui.dialogs import ConfirmDialog
 from appliance.tui.robots.takeover import TakeoverScreen
 from appliance.tui.tasks.review import ReviewScreen
 
 from .conftest import LAME
-from .operating import LONG_S, Operator, operator
+from .operating import AUDITED, LONG_S, WATCHED, Operator, does, operator
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 
@@ -48,6 +47,28 @@ async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
     """Return somebody else's eyes on the fleet."""
     async with FleetClient(fleet.endpoint, operator="eve") as made:
         yield made
+
+
+@pytest.fixture(autouse=True)
+async def watched(request: pytest.FixtureRequest, client: FleetClient) -> AsyncIterator[None]:
+    """Hold a test to what it says it `does`: each action was done, and stands in the audit with who and why."""
+    began_ns = time.time_ns()
+    WATCHED.clear()
+    yield
+    wanted = getattr(request.function, "does", ())
+    begun = {each for app in WATCHED for each in app.begun}
+    done = {each for app in WATCHED for each in app.done}
+    for name in wanted:
+        assert name in (done if BY_NAME[name].do is not None else {action for action, _ in begun}), name
+    names = {app.view.operator for app in WATCHED}
+    acts, silent = await client.acts(500)
+    assert not silent
+    told = {(act.verb, act.why) for act in acts if act.by in names and act.at_ns >= began_ns and act.outcome == "done"}
+    assert {AUDITED[name] for name in wanted if name in AUDITED} <= {verb for verb, _ in told}
+    for name, why in begun:
+        if name in wanted and why:
+            # Words after `:stop` that name no robot are why.
+            assert any(verb == AUDITED[name] and known.endswith(why) for verb, known in told), (name, why)
 
 
 @pytest.fixture
@@ -95,12 +116,12 @@ async def confirm(ann: Operator, *words: str) -> None:
     await ann.press("y")
 
 
-async def proposed(ann: Operator, client: FleetClient) -> TaskRecord:
-    """Submit the tour for review; its record once the plan waits and is looked at."""
+async def proposed(ann: Operator, client: FleetClient, instruction: str = TOUR) -> TaskRecord:
+    """Submit an instruction for review; its record once the plan waits and is looked at."""
     known = set(ann.store.tasks)
     await ann.press("s")
     await ann.see("What shall the robots do?")
-    await ann.write(TOUR)
+    await ann.write(instruction)
     await ann.press("enter")
     await ann.see("Enter runs this plan")
     await ann.press("f2")
@@ -114,6 +135,24 @@ async def proposed(ann: Operator, client: FleetClient) -> TaskRecord:
 # --- tasks -------------------------------------------------------------------------------------------------------
 
 
+@does("submit")
+async def test_submit(ann: Operator, client: FleetClient) -> None:
+    """An instruction is planned, the plan is seen, and Enter runs exactly that one, in the operator's name."""
+    await ann.line("submit rover_2: go to dock 1")
+    await ann.see("What shall the robots do?", "rover_2: go to dock 1")
+    await ann.press("enter")
+    await ann.see("Enter runs this plan", "goto", "rover_2")
+    known = set(ann.store.tasks)
+    await ann.press("enter")
+    await ann.until(lambda: set(ann.store.tasks) - known)
+    (task,) = set(ann.store.tasks) - known
+    record = await record_of(client, task, final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+    assert (record.submitter, record.instruction) == ("ann", "rover_2: go to dock 1")
+    assert [each.subtask.robot for each in record.subtasks] == ["rover_2"]
+
+
+@does("edit-robot", "edit-params", "edit-out", "approve")
 async def test_approve_an_edited_plan(ann: Operator, client: FleetClient) -> None:
     """Another robot, other parameters, one subtask fewer: checked, approved, and run so and not otherwise."""
     task = (await proposed(ann, client)).id
@@ -129,27 +168,68 @@ async def test_approve_an_edited_plan(ann: Operator, client: FleetClient) -> Non
     await ann.see("dock 1", "checked: it may run")
     await ann.press("end", "d")
     await ann.see("taken out", "checked: it may run")
-    await ann.press("a")
+    await ann.line("approve dock 3 is closed")
     await confirm(ann, "Approve the edited plan", "rover_2")
     record = await record_of(client, task, final)
     assert record.state is TaskState.SUCCEEDED, record.failure
     (step,) = [each.subtask for each in record.subtasks]
     assert (step.robot, step.params["place"]) == ("rover_2", "dock 1")
     assert record.decision is not None
-    assert (record.decision.by, record.decision.edited) == ("ann", True)
+    assert (record.decision.by, record.decision.edited, record.decision.why) == ("ann", True, "dock 3 is closed")
 
 
+@does("edit-up", "edit-down", "edit-after", "edit-undo", "edit-reload", "approve")
+async def test_the_order_of_a_plan_is_edited(ann: Operator, client: FleetClient) -> None:
+    """What comes after what is changed, taken back and begun anew; each draft is checked, and the last one runs."""
+    record = await proposed(ann, client, "rover_1: go to dock 3, then go to dock 2, then go to dock 1")
+    steps = record.proposal.plan.subtasks if record.proposal is not None else ()
+    assert [each.after for each in steps] == [(), ("s1",), ("s2",)]
+
+    def after() -> list[tuple[str, ...]]:
+        """What the draft on the screen has each subtask come after, in the order of their names."""
+        assert isinstance(ann.app.screen, ReviewScreen)
+        draft = ann.app.screen.draft
+        return [draft.of_id(name).after for name in ("s1", "s2", "s3")] if draft is not None else []
+
+    await ann.press("home", "right_square_bracket")
+    await ann.see("checked: it may run")
+    swapped = after()
+    assert swapped != [(), ("s1",), ("s2",)]
+    await ann.line("edit-up s1")
+    await ann.until(lambda: after() == [(), ("s1",), ("s2",)])
+    await ann.press("u")
+    await ann.until(lambda: after() == swapped)
+    await ann.line("edit-reload")
+    await ann.until(lambda: after() == [(), ("s1",), ("s2",)])
+    await ann.line("edit-after s1 s3")
+    await ann.see("circle")
+    assert after() == [(), ("s1",), ("s2",)]
+    await ann.line("edit-after s3 s1")
+    await ann.see("s2 and s3: rover_1 cannot do goto and goto at the same time")
+    assert after() == [(), ("s1",), ("s1",)]
+    await ann.line("edit-robot s3 rover_2")
+    await ann.see("robot: rover_1 → rover_2", "checked: it may run")
+    await ann.press("a")
+    await confirm(ann, "Approve the edited plan")
+    ended = await record_of(client, record.id, final)
+    assert ended.state is TaskState.SUCCEEDED, ended.failure
+    assert [ended.of(name).subtask.after for name in ("s1", "s2", "s3")] == [(), ("s1",), ("s1",)]
+    assert [ended.of(name).subtask.robot for name in ("s1", "s2", "s3")] == ["rover_1", "rover_1", "rover_2"]
+
+
+@does("reject")
 async def test_reject(ann: Operator, client: FleetClient) -> None:
     """A plan that is turned down does not run, and the record says who did so."""
     task = (await proposed(ann, client)).id
-    await ann.press("x")
+    await ann.line("reject not today")
     await confirm(ann, "Reject the plan")
     record = await record_of(client, task, final)
     assert record.decision is not None
-    assert (record.decision.by, record.decision.approved) == ("ann", False)
+    assert (record.decision.by, record.decision.approved, record.decision.why) == ("ann", False, "not today")
     assert all(not each.attempts for each in record.subtasks)
 
 
+@does("pause", "hold", "resume")
 async def test_pause_hold_and_resume(ann: Operator, client: FleetClient) -> None:
     """Paused, nothing further begins; held, a run ends at its checkpoint; resumed, it goes on in a new attempt."""
     await client.submit(counting("t-hold", steps=ENDLESS))
@@ -165,13 +245,14 @@ async def test_pause_hold_and_resume(ann: Operator, client: FleetClient) -> None
     await confirm(ann, "Hold task t-hold?")
     record = await record_of(client, "t-hold", lambda record: record.paused and not running(record))
     assert record.paused == "paused by ann: a visitor"
-    await ann.line("resume t-hold")
+    await ann.line("resume t-hold the visitor has left")
     await confirm(ann, "Resume task t-hold?")
     record = await record_of(client, "t-hold", lambda record: running(record) and record.of("s1").attempt == 2)
     assert not record.paused
     await client.cancel("t-hold")
 
 
+@does("cancel", "retry", "retry-subtask")
 async def test_cancel_and_retry(ann: Operator, client: FleetClient) -> None:
     """A cancelled task ends with who asked for it; tried again, whole or one subtask of it, it runs again."""
     await client.submit(counting("t-again", steps=ENDLESS, count=2))
@@ -187,16 +268,17 @@ async def test_cancel_and_retry(ann: Operator, client: FleetClient) -> None:
     await ann.press("t")
     await confirm(ann, "Try task t-again again?")
     await record_of(client, "t-again", running)
-    await ann.line("cancel t-again")
+    await ann.line("cancel t-again one of them is enough")
     await confirm(ann, "Cancel task t-again?")
     await record_of(client, "t-again", final)
-    await ann.line("retry-subtask t-again/s2")
+    await ann.line("retry-subtask t-again/s2 this one")
     await confirm(ann, "Try t-again/s2 again?")
     record = await record_of(client, "t-again", running)
     assert (record.retries, record.of("s2").state) == (2, SubtaskState.RUNNING)
     await client.cancel("t-again")
 
 
+@does("migrate")
 async def test_migrate_by_hand(ann: Operator, client: FleetClient) -> None:
     """A run is moved to the other gateway with its checkpoint, and ends there."""
     await client.submit(counting("t-move", steps=ENDLESS, then=20))
@@ -206,7 +288,7 @@ async def test_migrate_by_hand(ann: Operator, client: FleetClient) -> None:
     await select(ann, "t-move")
     await ann.press("enter")
     await ann.until(lambda: ann.chosen.get("subtask") == "t-move/s1")
-    await ann.line(f"migrate t-move/s1 {target}")
+    await ann.line(f"migrate t-move/s1 {target} to see it move")
     await ann.hears(f"moved from {source} to {target}")
     record = await record_of(client, "t-move", final)
     assert record.state is TaskState.SUCCEEDED, record.failure
@@ -214,6 +296,7 @@ async def test_migrate_by_hand(ann: Operator, client: FleetClient) -> None:
     assert (record.of("s1").result or {})["resumed_from"] > 0
 
 
+@does("answer")
 async def test_answer_a_question(ann: Operator, client: FleetClient) -> None:
     """What a skill asks is on the robot's line; the answer reaches the skill, which ends with it."""
     wait = Subtask(id="s1", skill="wait_for", robot="rover_1", params={"event": "the gate is open"})
@@ -238,11 +321,12 @@ def rover(client: FleetClient, name: str = "rover_1") -> RobotInfo:
     return client.plane.registry.robots[name]
 
 
+@does("takeover", "give-back")
 async def test_take_over_and_give_back(ann: Operator, client: FleetClient) -> None:
     """While a key is held the robot moves, nobody else's order does, and given back it is anybody's again."""
     await ann.press("3", "home")
     await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
-    await ann.press("o")
+    await ann.line("takeover rover_1 to look behind it")
     await confirm(ann, "Take rover_1 over?")
     await ann.see("⇅ yours")
     before = rover(client).pose
@@ -260,6 +344,7 @@ async def test_take_over_and_give_back(ann: Operator, client: FleetClient) -> No
     assert {"control_take", "control_give"} <= {act.verb for act in acts if act.by == "ann"}
 
 
+@does("stop-robot", "stop", "resume-robots")
 async def test_stop_and_resume_one_robot(ann: Operator, client: FleetClient) -> None:
     """One key stops the robot under the cursor and no other; let go, after a question, it is free again."""
     await ann.press("3", "home")
@@ -273,8 +358,17 @@ async def test_stop_and_resume_one_robot(ann: Operator, client: FleetClient) -> 
     await confirm(ann, "Lift the soft stop of rover_1?")
     await ann.hears("rover_1 may move again")
     assert not (await client.standing()).active
+    await ann.line("stop rover_2 a person in the aisle")
+    await ann.hears("soft stop of rover_2", "holding: rover_2")
+    (stop,) = (await client.standing()).active
+    assert (stop.robots, stop.by, stop.why) == (("rover_2",), "ann", "a person in the aisle")
+    await ann.line("resume-robots rover_2 gone")
+    await confirm(ann, "Lift the soft stop of rover_2?", "Why: gone")
+    await ann.hears("rover_2 may move again")
+    assert not (await client.standing()).active
 
 
+@does("stop", "resume-robots", "resume-all")
 async def test_stop_and_resume_the_fleet(ann: Operator, client: FleetClient) -> None:
     """F8 stops all robots, read-only too, and their tasks wait; lifting it needs unlocking, asks, and frees all."""
     await client.submit(TaskRequest(instruction=f"{TOUR}, then go to dock 3", id="t-stop"))
@@ -293,18 +387,29 @@ async def test_stop_and_resume_the_fleet(ann: Operator, client: FleetClient) -> 
     assert not (await client.standing()).active
     record = await record_of(client, "t-stop", final)
     assert record.state is TaskState.SUCCEEDED, record.failure
+    await ann.line("stop everybody out of the hall")
+    await ann.until_true(lambda: _stops(client, 1))
+    await ann.press("3", "Z")
+    await confirm(ann, "Lift the soft stops of all robots?")
+    await ann.until_true(lambda: _stops(client, 0))
+
+
+async def _stops(client: FleetClient, count: int) -> bool:
+    """Whether so many soft stops are in force."""
+    return len((await client.standing()).active) == count
 
 
 # --- gateways and pools ------------------------------------------------------------------------------------------
 
 
+@does("drain", "undrain")
 async def test_drain_and_undrain(ann: Operator, client: FleetClient) -> None:
     """A drained gateway says so of itself and gets no run; undrained it is as before."""
     await ann.press("1", "home")
     await ann.until(lambda: ann.chosen.get("gateway") == "gw-1")
     await ann.until(lambda: ann.store.gateways["gw-1"].latency_ms is not None)
-    await ann.press("d")
-    await confirm(ann, "Drain gw-1?")
+    await ann.line("drain gw-1 its fan is loud")
+    await confirm(ann, "Drain gw-1?", "its fan is loud")
     await ann.until(lambda: client.plane.registry.gateways["gw-1"].draining)
     await ann.see("◌ draining")
     await client.submit(counting("t-dry", steps=2))
@@ -315,6 +420,7 @@ async def test_drain_and_undrain(ann: Operator, client: FleetClient) -> None:
     await ann.see("gw-1", without="◌ draining")
 
 
+@does("warm", "evict")
 async def test_warm_and_evict(ann: Operator, client: FleetClient) -> None:
     """Containers that are asked for get ready; the one under the cursor is given up, after a question."""
 
@@ -323,7 +429,7 @@ async def test_warm_and_evict(ann: Operator, client: FleetClient) -> None:
         return {name for name, each in known.items() if each.state is ContainerState.READY and "base" in each.image}
 
     await ann.press("4")
-    await ann.line("warm base 3 gw-2")
+    await ann.line("warm base 3 gw-2 a tour comes")
     await ann.hears("gw-2: ", "of base ready")
     await ann.until(lambda: len(held()) >= 3)
     await ann.see("◔ start")
@@ -339,33 +445,8 @@ async def test_warm_and_evict(ann: Operator, client: FleetClient) -> None:
     await ann.see("pool_evict", "pool_warm", "ann")
 
 
-async def podman(*arguments: str) -> None:
-    """Run podman; fails with what it says."""
-    process = await asyncio.create_subprocess_exec(
-        "podman", *arguments, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
-    )
-    said, _ = await process.communicate()
-    assert process.returncode == 0, said.decode()
-
-
-@pytest.fixture
-async def broken(lame: Path, tmp_path: Path) -> AsyncIterator[Callable[[], object]]:
-    """Make an image of which no container starts; returns what mends it."""
-    catalogue = load_catalogue([lame.parent.parent])
-    mine, good = (reference(catalogue.images[name], PoolConfig()) for name in (LAME, "base"))
-    empty = tmp_path / "empty.tar"
-    with tarfile.open(empty, "w") as archive:
-        archive.addfile(tarfile.TarInfo("nothing"), io.BytesIO())
-    await podman("import", str(empty), mine)
-
-    async def mend() -> None:
-        await podman("tag", good, mine)
-
-    yield mend
-    await podman("rmi", "--force", "--ignore", mine)
-
-
-async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callable[[], object]) -> None:
+@does("warm", "release", "evict")
+async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callable[[], Awaitable[None]]) -> None:
     """An image that does not start is left alone with the reason; mended and released, containers of it start."""
     await ann.press("1")
     await ann.line(f"warm {LAME} 1 gw-1")
@@ -373,10 +454,8 @@ async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callab
     await ann.see("✘ gw-1", "left alone")
     await ann.line("release base gw-1")
     await ann.hears("base is not in quarantine")
-    mending = broken()
-    assert asyncio.iscoroutine(mending)
-    await mending
-    await ann.line(f"release {LAME} gw-1")
+    await broken()
+    await ann.line(f"release {LAME} gw-1 it is mended")
     await ann.hears("gw-1: started again")
     await ann.line(f"warm {LAME} 1 gw-1")
     await ann.hears(f"gw-1: 1 of {LAME} ready")
@@ -385,6 +464,7 @@ async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callab
     await ann.hears("1 given up")
 
 
+@does("fetch")
 async def test_fetch_an_image(ann: Operator, fleet: FleetState) -> None:
     """A gateway is asked to have an image; on one machine it has what the others have, says so, and audits it."""
     await ann.line(f"fetch {reference(load_catalogue().images['base'], PoolConfig())} gw-2 to be sure")
@@ -392,20 +472,15 @@ async def test_fetch_an_image(ann: Operator, fleet: FleetState) -> None:
     await ann.hears("image_fetch", "(to be sure)", "done")
 
 
-async def test_swap_the_model(ann: Operator, client: FleetClient, project_root: Path, tmp_path: Path) -> None:
+@does("swap-model")
+async def test_swap_the_model(ann: Operator, client: FleetClient, toy: Path, tmp_path: Path) -> None:
     """A model is tested before it takes over; then the gateway says that it plans with it. No model is refused."""
-    spec = importlib.util.spec_from_file_location("tiny_model", project_root / "tests" / "tiny_model.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    folder = module.build(tmp_path / "toy")
     await ann.press("5", "home")
     await ann.until(lambda: ann.chosen.get("gateway") == "gw-1")
     await ann.line(f"swap-model gw-1 {tmp_path}/nothing")
     await confirm(ann, "Have gw-1 plan with the model in")
     await ann.until(lambda: any(each.level == "error" and "nothing" in each.text for each in ann.store.entries))
-    await ann.line(f"swap-model gw-1 {folder}")
+    await ann.line(f"swap-model gw-1 {toy} it is small")
     await confirm(ann, "Have gw-1 plan with the model in")
     await ann.hears("gw-1 plans with toy instead of")
     await ann.until(
@@ -421,6 +496,7 @@ async def test_swap_the_model(ann: Operator, client: FleetClient, project_root: 
 # --- two operators -----------------------------------------------------------------------------------------------
 
 
+@does("approve", "pause", "takeover")
 async def test_two_operators_one_winner(fleet: FleetState, client: FleetClient) -> None:
     """Both approve a plan, both pause a task, both take a robot: one does each time, the other hears who was faster."""
     instruction = "rover_2: go to dock 1"

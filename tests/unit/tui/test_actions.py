@@ -1,5 +1,6 @@
 """The registry of actions, the grammar of the `:` line, and each action on a fake fleet."""
 
+import ast
 import asyncio
 import contextlib
 from pathlib import Path
@@ -70,6 +71,22 @@ def test_own_keys_are_checked() -> None:
         keymap({"cancel": ""})
     with pytest.raises(ConfigError, match="is both"):
         keymap({"drain": "u"})
+
+
+def test_each_action_that_changes_something_is_done_on_a_real_fleet(project_root: Path) -> None:
+    """Whatever changes the fleet or a plan under review has a test that says it `does` it, and is held to it there."""
+    changing = {each.name for each in ACTIONS if each.writes or {"review", "takeover"} & set(each.screens)}
+    tests = project_root / "tests" / "integration" / "tui" / "test_orders.py"
+    said = {
+        word.value
+        for test in ast.parse(tests.read_text()).body
+        if isinstance(test, ast.AsyncFunctionDef)
+        for mark in test.decorator_list
+        if isinstance(mark, ast.Call) and isinstance(mark.func, ast.Name) and mark.func.id == "does"
+        for word in mark.args
+        if isinstance(word, ast.Constant)
+    }
+    assert changing == said
 
 
 # --- grammar -----------------------------------------------------------------------------------------------------

@@ -57,3 +57,11 @@ def test_browsers_get_what_was_asked_for(opened: Callable[..., list[tuple[Any, .
     words = command[command.index("tui") + 1 :]
     _, _, config, _ = opened(*words)[-1]
     assert (config.write, config.theme, config.keys) == (True, "light", {"palette": "f2"})
+
+
+def test_logs_of_the_fleet_that_was_named_are_found(
+    opened: Callable[..., list[tuple[Any, ...]]], tmp_path: Path
+) -> None:
+    """The folder in which a local fleet records is looked through, wherever `--dir` has it."""
+    (config,) = (call[2] for call in opened("--dir", str(tmp_path / "fleet")))
+    assert config.logs == (str(tmp_path / "fleet" / "record"),)

@@ -41,6 +41,19 @@ def test_seeks_within_the_log() -> None:
         player.seek(float("nan"), 3.0)
 
 
+def test_no_nanosecond_is_lost() -> None:
+    """Times of today are exact: at the beginning the first message is shown, at the end the last."""
+    start = 1_795_380_108_959_123_457
+    player = Player(start, start + 7 * S + 1)
+    assert player.at_ns(0.0) == start
+    player.seek(player.length_s, 1.0)
+    assert player.at_ns(1.0) == start + 7 * S + 1
+    player.seek(0.0, 2.0)
+    assert player.at_ns(2.0) == start
+    player.play(3.0)
+    assert player.at_ns(4.0) == start + S
+
+
 def test_waits_for_what_is_not_read_yet() -> None:
     """When reading is slower than the rate, the clock waits instead of skipping."""
     player = Player(0, 100 * S)
