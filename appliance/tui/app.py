@@ -160,6 +160,7 @@ class SwiftbotApp(Ordering):
             self.notify("a recorded log cannot be steered", severity="warning")
             return
         self.unlocked = True
+        self.clear_notifications()  # one of them said how to do this
         self.draw(force=True)
 
     def do_lock(self, _given: Mapping[str, str]) -> None:

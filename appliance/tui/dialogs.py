@@ -85,6 +85,6 @@ def harmless(content: RenderableType, width: int) -> Text:
     for line in console.render_lines(content, pad=False):
         for segment in line:
             if not segment.control:
-                found.append(safe(segment.text, LONGEST_PIECE), segment.style)
+                found.append(safe(segment.text, LONGEST_PIECE, blanks=True), segment.style)
         found.append("\n")
     return found

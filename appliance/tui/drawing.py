@@ -38,6 +38,16 @@ def duration(seconds: float) -> str:
     return f"{seconds / 86_400:.0f} d"
 
 
+def file_size(size: int) -> str:
+    """Return the size of a file for people, in at most nine characters."""
+    return f"{size / 2**10:.0f} KiB" if size < 2**20 else f"{size / 2**20:.1f} MiB"
+
+
+def counted(number: int, thing: str) -> str:
+    """Return so many of a thing whose plural takes an s."""
+    return f"{number:,} {thing}{'' if number == 1 else 's'}"
+
+
 def bar(fraction: float, width: int = _BAR_WIDTH) -> str:
     """Return a progress bar of `width` cells and the percentage; `fraction` outside 0 to 1 is cut."""
     share = min(1.0, max(0.0, fraction)) if math.isfinite(fraction) else 0.0

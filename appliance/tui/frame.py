@@ -20,13 +20,14 @@ from textual.widgets import Static
 from appliance.tui import actions
 from appliance.tui.action import Action, key_name
 from appliance.tui.data import View
-from appliance.tui.drawing import clock
+from appliance.tui.drawing import clock, counted
 from appliance.tui.filter import Filter
 from appliance.tui.keys import keys_of
 from appliance.tui.prompt import Lines, Prompt
 from appliance.tui.safe import safe
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Store
+from appliance.tui.widgets import Bar
 
 T = TypeVar("T")
 
@@ -134,12 +135,12 @@ class FleetScreen(Screen[None], inherit_bindings=False):
 
     def compose(self) -> ComposeResult:
         """Make the screen."""
-        yield Static(id="head")
+        yield Bar(id="head")
         yield Static(id="banner")
         with Vertical(id="body"):
             yield from self.body()
         yield Prompt(self.host.completions, self.host.lines)
-        yield Static(id="foot")
+        yield Bar(id="foot")
 
     @property
     def prompt(self) -> Prompt:
@@ -188,10 +189,11 @@ class FleetScreen(Screen[None], inherit_bindings=False):
             return
         self._said = said
         lost = len(store.gateways) - present
-        counts = f"{present} gw{f' ({lost} lost)' if lost else ''} · {len(store.robots)} robots · {running} active"
+        gateways = f"{present} gw{f' ({lost} lost)' if lost else ''}"
+        counts = f"{gateways} · {counted(len(store.robots), 'robot')} · {running} active"
         # Of fixed height: nothing has to be laid out anew for them.
-        self.query_one("#head", Static).update(self._head(counts, pressing), layout=False)
-        self.query_one("#foot", Static).update(self._foot(), layout=False)
+        self.query_one("#head", Bar).update(self._head(counts, pressing), layout=False)
+        self.query_one("#foot", Bar).update(self._foot(), layout=False)
         self._draw_banner(store)
 
     def _count(self, store: Store) -> tuple[int, str]:

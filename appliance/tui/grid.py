@@ -26,6 +26,8 @@ Draw = Callable[[Any], Sequence[Cell]]
 
 _GUTTER = 2
 """Cells on the left for the cursor's sign, so that the cursor is told by more than colour."""
+_MUCH = 8
+"""Cells left over, of which one is spared."""
 _KEPT = 400
 """Lines kept as they were drawn."""
 
@@ -297,7 +299,7 @@ def fit(text: str, width: int, *, right: bool = False) -> str:
 def widths(columns: Sequence[Column], room: int) -> tuple[int, ...]:
     """Return how wide each column is, 0 for one that is left out: first those with the highest `drop`, then the last.
 
-    What is left over goes to those that may grow, evenly.
+    What is left over goes to those that may grow, evenly; of much one cell stays free, so that none touches the edge.
     """
     shown = [True] * len(columns)
 
@@ -313,6 +315,7 @@ def widths(columns: Sequence[Column], room: int) -> tuple[int, ...]:
     left = room - needed()
     if left < 0:
         found[0] = max(1, room)
+    left -= left > _MUCH
     for number, index in enumerate(growing):
         if left > 0:
             found[index] += left // len(growing) + (number < left % len(growing))

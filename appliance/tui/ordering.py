@@ -17,6 +17,7 @@ from appliance.tui.grammar import Command
 from appliance.tui.keys import PROMPTS
 from appliance.tui.safe import safe
 from appliance.tui.shell import Shell
+from appliance.tui.tasks.facts import state_cell
 
 log = structlog.get_logger(__name__)
 
@@ -125,9 +126,9 @@ class Ordering(Shell):
             if isinstance(answer, TaskRecord):
                 # It is heard as well, but perhaps later than the person looks.
                 self.view.store.take_task(answer)
-                answer = f"task {answer.id}: {answer.state}"
+                answer = f"task {answer.id}: {state_cell(answer)[0]}"
             if action.long:
-                self.push_screen(TextDialog(f"{action.title}: {safe(line, 80)}", answer))
+                self.push_screen(TextDialog(f":{safe(line, 80)}", answer))
             else:
                 self.note(line, str(answer))
                 self.notify(safe(answer), markup=False)

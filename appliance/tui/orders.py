@@ -11,7 +11,7 @@ from appliance.client import FleetClient
 from appliance.errors import PayloadError
 from appliance.pool.api import Evicted, WarmAsk
 from appliance.tui.action import Given
-from appliance.tui.drawing import clock
+from appliance.tui.drawing import clock, counted
 from appliance.tui.safe import safe
 
 WARM_WAIT_S = 30.0
@@ -55,7 +55,7 @@ async def acts(fleet: FleetClient, given: Given, _by: str) -> RenderableType:
 async def drain(fleet: FleetClient, given: Given, _by: str) -> str:
     """Have a gateway give its runs away and take no more."""
     state = await fleet.drain(given["gateway"], 0.0, why=_why(given))
-    return f"{state.gateway} drains: {len(state.left)} runs left"
+    return f"{state.gateway} drains: {counted(len(state.left), 'run')} left"
 
 
 async def undrain(fleet: FleetClient, given: Given, _by: str) -> str:

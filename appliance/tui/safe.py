@@ -19,11 +19,16 @@ _SPACES = "\t\n\r\v\f\x1c\x1d\x1e\x1f\x85\u2028\u2029"
 _UNSEEN = "�"
 
 
-def safe(value: object, most: int = MOST) -> str:
+def safe(value: object, most: int = MOST, *, blanks: bool = False) -> str:
     """Return foreign text as one line of at most `most` characters that a terminal shows and does not obey.
 
     Line breaks and tabs become a space, runs of white space one; other control characters become their pictures
     (escape: ␛); characters that set the direction of writing, join, or have no form become one sign each.
+
+    Args:
+        value: the text.
+        most: characters.
+        blanks: leave all blanks where they are, as in a line that has been laid out.
     """
     text = value if isinstance(value, str) else str(value)
     cut = len(text) > most
@@ -31,7 +36,8 @@ def safe(value: object, most: int = MOST) -> str:
         text = text[: max(0, most - 1)]
     if not (text.isascii() and text.isprintable()):
         text = "".join(_shown(text))
-    text = " ".join(text.split())
+    if not blanks:
+        text = " ".join(text.split())
     return f"{text}…" if cut else text
 
 

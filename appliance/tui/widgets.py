@@ -1,4 +1,4 @@
-"""Textual's own widgets as they are used here: a field whose editing keys a person can change, and a box that scrolls.
+"""Textual's own widgets as they are used here: a field with editing keys of one's own, a box that scrolls, a bar.
 
 Terminal multiplexers keep control keys for themselves (`screen` takes ^a, `tmux` ^b, both may take any other), so each
 one that does something here has a name under which it is given other keys (`keys.keymap`).
@@ -6,7 +6,7 @@ one that does something here has a name under which it is given other keys (`key
 
 from textual.binding import Binding
 from textual.containers import VerticalScroll
-from textual.widgets import Input
+from textual.widgets import Input, Static
 
 from appliance.tui.keys import line_bindings
 
@@ -28,3 +28,11 @@ class Pane(VerticalScroll, inherit_bindings=False):
         Binding("pageup", "page_up", show=False),
         Binding("pagedown", "page_down", show=False),
     ]
+
+
+class Bar(Static):
+    """Lines of names that can be clicked, in their own colours: Textual would underline all of it, as links."""
+
+    def __init__(self, *, id: str) -> None:  # noqa: A002 - Textual's name
+        super().__init__(id=id)
+        self.auto_links = False

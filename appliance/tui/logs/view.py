@@ -8,6 +8,7 @@ from typing import Generic, TypeVar, cast
 
 from rich.cells import cell_len
 from rich.console import Console
+from rich.segment import Segment
 from rich.text import Text
 from textual.app import App
 from textual.binding import Binding
@@ -19,6 +20,8 @@ T = TypeVar("T")
 
 WIDEST = 600
 """Cells that a line may be scrolled sideways."""
+SIDEWAYS = 20
+"""Cells that it is by one key."""
 
 
 class LineView(ScrollView, Generic[T], can_focus=True, inherit_bindings=False):
@@ -38,11 +41,12 @@ class LineView(ScrollView, Generic[T], can_focus=True, inherit_bindings=False):
         Binding("pagedown", "page(1)", show=False),
         Binding("home,g", "first", show=False),
         Binding("end,G", "last", show=False),
-        Binding("left,h", "scroll_left", show=False),
-        Binding("right,l", "scroll_right", show=False),
+        Binding("left,h", "sideways(-1)", show=False),
+        Binding("right,l", "sideways(1)", show=False),
     ]
+    # No bar below: it would take a line of few, and what is cut is marked where it is.
     DEFAULT_CSS = """
-    LineView { height: 1fr; scrollbar-size: 1 1; background: $background; color: $foreground; }
+    LineView { height: 1fr; scrollbar-size: 0 1; background: $background; color: $foreground; }
     """
 
     def __init__(
@@ -109,6 +113,10 @@ class LineView(ScrollView, Generic[T], can_focus=True, inherit_bindings=False):
         """Scroll by a window."""
         self._go(round(self.scroll_offset.y) + step * max(1, self.size.height - 1))
 
+    def action_sideways(self, step: int) -> None:
+        """Scroll to the side."""
+        self.scroll_to(x=max(0, round(self.scroll_offset.x) + step * SIDEWAYS), animate=False, immediate=True)
+
     def action_first(self) -> None:
         """Go to the oldest line."""
         self._go(0)
@@ -147,6 +155,11 @@ class LineView(ScrollView, Generic[T], can_focus=True, inherit_bindings=False):
             return Strip.blank(width, style)
         self.drawn += 1
         line = self._text(self._lines[index])
-        left = round(self.scroll_offset.x)
-        strip = Strip([each for each in line.render(self._renderer()) if each.text], cell_len(line.plain))
-        return strip.crop(left, left + width).adjust_cell_length(width, style).apply_style(style)
+        left, long = round(self.scroll_offset.x), cell_len(line.plain)
+        strip = Strip([each for each in line.render(self._renderer()) if each.text], long)
+        before, after = int(left > 0 and long > 0), int(long > left + width)
+        shown = strip.crop(left + before, left + width - after)
+        if before or after:
+            mark = Strip([Segment("…")], 1)
+            shown = Strip.join([*[mark] * before, shown.adjust_cell_length(width - before - after), *[mark] * after])
+        return shown.adjust_cell_length(width, style).apply_style(style)

@@ -9,7 +9,7 @@ from textual.app import ComposeResult
 from textual.widgets import Static
 
 from appliance.errors import PayloadError
-from appliance.tui.drawing import Cell
+from appliance.tui.drawing import Cell, counted, file_size
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
@@ -34,7 +34,7 @@ def file_cells(each: LogFile) -> tuple[Cell, ...]:
     return (
         (safe(each.path.name, 120), "bold"),
         time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(each.written_s)),
-        f"{each.size / 2**20:.1f} MiB",
+        file_size(each.size),
         safe(str(each.path.parent), 200),
     )
 
@@ -119,8 +119,8 @@ class ReplayScreen(FleetScreen):
             f" {told(at_s)} of {told(length_s)} · {player.rate:g}x · {clock(player.at_ns(now))}",
             f" · fleet {safe(replay.fleet, 40)}\n",
             (f"{timeline(share, max(10, self.size.width - 2))}\n", "cyan"),
-            f"{safe(Path(replay.about.path).name, 80)}: {replay.about.messages:,} messages on "
-            f"{len(replay.about.channels):,} keys",
+            f"{safe(Path(replay.about.path).name, 80)}: {counted(replay.about.messages, 'message')} on "
+            f"{counted(len(replay.about.channels), 'key')}",
         )
         if replay.about.dropped:
             out.append(f", {replay.about.dropped:,} were not recorded", "yellow")

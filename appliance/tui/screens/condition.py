@@ -9,7 +9,7 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance.record.facts import RecorderStatus
-from appliance.tui.drawing import clock
+from appliance.tui.drawing import clock, counted
 from appliance.tui.safe import safe
 from appliance.tui.store import SILENT, Gateway
 
@@ -100,15 +100,15 @@ def recorder_notes(recorders: Iterable[RecorderStatus]) -> list[Text]:
     """Return how the recorders are, a line each."""
     lines: list[Text] = []
     for each in recorders:
-        name = safe(each.id, 63)
+        name = f"recorder {safe(each.id, 63)}".removesuffix(" recorder")
         dropped = sum(each.dropped.values())
         lost = f", {dropped} lost ({safe(', '.join(sorted(each.dropped)))})" if dropped else ""
         if each.problem:
             remedy = "`swiftbot record` starts it again" if each.state == "failed" else "make room, or see its log"
-            lines.append(Text(f"✘ recorder {name}: {safe(each.problem)}{lost} → {remedy}", "red"))
+            lines.append(Text(f"✘ {name}: {safe(each.problem)}{lost} → {remedy}", "red"))
         elif each.state == SILENT:
-            lines.append(Text(f"▲ recorder {name}: not heard any more → is `swiftbot record` running?", "yellow"))
+            lines.append(Text(f"▲ {name}: not heard any more → is `swiftbot record` running?", "yellow"))
         else:
             style = "yellow" if dropped else "dim"
-            lines.append(Text(f"✔ recorder {name}: {each.messages} messages in {safe(each.file, 200)}{lost}", style))
+            lines.append(Text(f"✔ {name}: {counted(each.messages, 'message')} in {safe(each.file, 200)}{lost}", style))
     return lines

@@ -6,7 +6,7 @@ from textual.widgets import Static
 
 from appliance.model import SubtaskState
 from appliance.tui import signs
-from appliance.tui.drawing import Cell, age, clock, milliseconds
+from appliance.tui.drawing import Cell, age, clock, counted, milliseconds
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
@@ -44,7 +44,10 @@ def about(gateway: Gateway, store: Store) -> Text:
                 f"; limits {'enforced' if each.limits_enforced else 'NOT enforced'}"
             ),
         ),
-        ("work", f"{each.running} runs, {each.queue} wait for a container, {each.tasks} tasks coordinated"),
+        (
+            "work",
+            f"{counted(each.running, 'run')}, {each.queue} wait for a container, coordinates {each.tasks}",
+        ),
         ("links", f"{latency}; ring: {arc}"),
         ("models", safe(", ".join(each.models) or "not told", 200)),
         ("robots", safe(", ".join(robots) or "none", 200)),

@@ -9,7 +9,7 @@ from textual.app import ComposeResult
 from textual.widgets import Static
 
 from appliance.model import Plan, PlannerStatus, SlotStatus
-from appliance.tui.drawing import Cell, bar, milliseconds
+from appliance.tui.drawing import Cell, bar, counted, milliseconds
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
@@ -95,11 +95,8 @@ def about(gateway: Gateway) -> Text:
             lines.append(Text(f"  ✘ {safe(slot.problem)} → {remedy}", "red"))
     cache = planner.cache
     looked = cache.hits + cache.misses
-    lines.append(
-        Text(
-            f"  cache     {cache.entries} plans, hit {bar(cache.hits / looked if looked > 0 else 0.0, 10)} of {looked}"
-        )
-    )
+    hit = bar(cache.hits / looked if looked > 0 else 0.0, 10)
+    lines.append(Text(f"  cache     {counted(cache.entries, 'plan')}, hit {hit} of {looked}"))
     if (upstream := planner.upstream) is not None:
         until = f", tried again in {upstream.retry_after_s:.0f} s" if upstream.retry_after_s > 0 else ""
         budget = f" of {upstream.budget:g}" if upstream.budget > 0 else ""
@@ -127,7 +124,7 @@ def confidences(plans: Iterable[Plan]) -> Text:
     parts = [
         f"{tier} {count / total:.0%}, {sorted(by_tier[tier])[count // 2]:.0%} sure (median)" for tier, count in order
     ]
-    return Text(f"plans of {total} known tasks: {'; '.join(parts)}")
+    return Text(f"plans of {counted(total, 'known task')}: {'; '.join(parts)}")
 
 
 class LlmScreen(FleetScreen):

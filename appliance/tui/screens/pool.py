@@ -25,14 +25,14 @@ from appliance.tui.screens.condition import gateway_notes
 from appliance.tui.store import Start, Store
 
 CONTAINERS = (
-    Column(title="image", width=10, grow=True),
-    Column(title="container", width=10, grow=True),
+    Column(title="image", width=9, grow=True),
+    Column(title="container", width=12),
     Column(title="gateway", width=8, grow=True),
     Column(title="state", width=10),
     Column(title="age", width=5, right=True),
     Column(title="hits", width=4, right=True),
     Column(title="cpu/mem", width=9, right=True),
-    Column(title="running now", width=14, grow=True),
+    Column(title="running now", width=13, grow=True),
     Column(title="cold", width=8, right=True, drop=1),
 )
 

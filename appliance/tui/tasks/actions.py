@@ -139,7 +139,7 @@ TASKS: tuple[Action, ...] = (
     ),
     Action(
         name="edit-params",
-        title="Parameters",
+        title="Params",
         help="Change the parameters of the subtask",
         keys=("e",),
         screens=("review",),
@@ -157,7 +157,7 @@ TASKS: tuple[Action, ...] = (
     ),
     Action(
         name="edit-out",
-        title="Take out",
+        title="Drop",
         help="Take the subtask out of the plan",
         keys=("d",),
         screens=("review",),

@@ -4,7 +4,7 @@ from rich.console import RenderableType
 
 from appliance.client import FleetClient
 from appliance.errors import PayloadError
-from appliance.model import TaskRecord
+from appliance.model import TaskRecord, TaskState
 from appliance.reasons import why_text
 from appliance.tasks.migration.api import MigrateAsk
 from appliance.tui.action import Given
@@ -22,9 +22,12 @@ def split_subtask(text: str) -> tuple[str, str]:
     return task, subtask
 
 
-async def cancel(fleet: FleetClient, given: Given, _by: str) -> TaskRecord:
+async def cancel(fleet: FleetClient, given: Given, _by: str) -> TaskRecord | str:
     """Stop a task."""
-    return await fleet.cancel(given["task"], why=given.get("why", ""))
+    record = await fleet.cancel(given["task"], why=given.get("why", ""))
+    # The answer may be older than what it answers: that the task runs is not what the operator should read then.
+    ending = record.state.final or record.state is TaskState.CANCELLING
+    return record if ending else f"task {record.id} is being cancelled"
 
 
 async def why(fleet: FleetClient, given: Given, _by: str) -> RenderableType:

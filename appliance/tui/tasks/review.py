@@ -153,7 +153,7 @@ class ReviewScreen(FleetScreen):
         elif self._checked != draft.plan:
             out.append("… not checked yet\n", "yellow")
         elif self._problems:
-            out.append(f"✘ it cannot run so: {len(self._problems)} problem(s)\n", "red")
+            out.append("✘ it cannot run so\n", "red")
             for problem in self._problems:
                 out.append(f"  · {safe(problem, 300)}\n", "red")
         else:

@@ -46,7 +46,7 @@ class TasksScreen(FleetScreen):
     BINDINGS = bindings("tasks")
     DEFAULT_CSS = """
     TasksScreen #tasks { height: 2fr; }
-    TasksScreen #detail-box { height: 3fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; }
+    TasksScreen #detail-box { height: 3fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; padding: 0 1; }
     TasksScreen #detail-box:focus { border-top: solid $accent; }
     """
 

@@ -25,7 +25,7 @@ from appliance.tui.tasks.facts import plan_lines
 from appliance.tui.widgets import Field, Pane
 
 _ASK = "Enter plans it · Tab completes names · ↑ earlier ones · Esc leaves"
-_REVIEW = "Enter runs this plan · {key} edits it first · edit the line for another · Esc leaves"
+_REVIEW = "Enter runs this plan · {key} edits it first · Esc leaves"
 INSTRUCTION_LIMIT = 2000
 """Characters of an instruction; a gateway refuses longer ones as well."""
 
@@ -91,7 +91,7 @@ def answer_text(answer: PlanAnswer) -> Text:
     out.append_text(plan_lines(plan.subtasks))
     for attempt in answer.attempts:
         if not attempt.ok:
-            out.append(f"{attempt.tier} tier declined: {safe('; '.join(attempt.problems), 300)}\n", "dim")
+            out.append(f"{attempt.tier} tier: {safe('; '.join(attempt.problems), 300)}\n", "dim")
     return out
 
 

@@ -195,3 +195,17 @@ async def test_screens_live_with_it(view: "FakeView", text: str) -> None:
             assert harmless("".join(part.text for strip in lines for part in strip))
             assert all(strip.cell_length == 80 for strip in lines)
         assert app.is_running
+
+
+def test_a_text_that_was_laid_out_keeps_its_blanks() -> None:
+    """Columns of a table stand apart in a dialog; what is hostile in one is shown all the same and not obeyed."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("gateway")
+    table.add_column("verdict")
+    table.add_row("gw-1", "taken")
+    table.add_row(Text("gw\x1b[31m"), Text("a  b"))
+    laid = dialogs.harmless(Group(Text("  attempt 1"), table), 60).plain
+    lines = [line.rstrip() for line in laid.splitlines()]
+    assert lines[:3] == ["  attempt 1", "gateway  verdict", "gw-1     taken"]
+    assert lines[3].startswith("gw␛[31m")
+    assert lines[3].endswith("a  b")
