@@ -9,7 +9,6 @@ import asyncio
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,8 +30,8 @@ SIZE = (110, 32)
 SCREENS: dict[str, tuple[str, ...]] = {
     "fleet": ("1",),
     "tasks": ("2", "down"),
-    "task": ("2", "down", "enter", "down"),
-    "review": ("escape", "2", "home", "a"),
+    "task": ("2", "down", "enter"),
+    "review": ("escape", "2", "home", "a", "end", "d"),
     "robots": ("escape", "3"),
     "robot": ("enter",),
     "pool": ("escape", "4"),
@@ -77,10 +76,10 @@ def newest_log(folder: Path) -> Path:
 async def of_log(state: FleetState, folder: Path) -> None:
     """Write a picture of replay, of the log that the fleet's recorder wrote."""
     log = newest_log(Path(state.record_dir))
-    app = SwiftbotApp(await ReplayView.open(log))
+    app = SwiftbotApp(await ReplayView.open(log), TuiConfig(logs=(str(log.parent),)))
     async with app.run_test(size=SIZE) as pilot:
         await settle(app, 1.0)
-        await pilot.press("right", "space")
+        await pilot.press("right", "right", "space")
         await settle(app, 3.0)
         app.export_svg(folder / "tui-replay.svg")
         await pilot.press("2")
@@ -96,7 +95,7 @@ async def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="swiftbot-pictures-") as directory:
         order = Order(
-            fleet=f"pictures{os.getpid()}-{time.monotonic_ns() % 1000}",
+            fleet=f"hall{os.getpid()}",
             directory=Path(directory) / "fleet",
             gateways=2,
             mavlink=1,
