@@ -18,6 +18,7 @@ import psutil
 import structlog
 
 from appliance.errors import DeadlineError, PlanError, RefusedError, SwiftbotError, UnreachableError
+from appliance.llm.doubts import doubts
 from appliance.llm.embedded import folder_of
 from appliance.llm.language.codec import Answer, read
 from appliance.llm.language.guide import shapes
@@ -46,6 +47,10 @@ _NO_PLAN = {
 _UNSOUND = 0.8
 """Times `local_min_confidence`: how sure it can be of a plan that breaks a rule of plans, so that another tier or an
 operator is asked. Of held-out instructions no such plan was right; yet a program reads the rules strictly."""
+_DOUBTFUL = 1
+"""How much a plan is broken that is merely doubtful (`doubts`)."""
+_FAR = 0.05
+"""Times the confidence of such a plan, which another one must have at least that is to be taken instead."""
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (
@@ -288,7 +293,8 @@ class LocalTier:
             return best
         # With its problems, for whoever repairs or refuses it, and at most for an operator to look at.
         most = _UNSOUND * self._config.local_min_confidence
-        return msgspec.structs.replace(best, confidence=min(best.confidence, most))
+        why = doubts(_meaning(best.plan, context)) if broken == _DOUBTFUL else ()
+        return msgspec.structs.replace(best, confidence=min(best.confidence, most), problems=(*best.problems, *why))
 
     async def _asked(self, process: ModelProcess, question: Question) -> Said:
         said = _said(await process.exchange({"question": msgspec.to_builtins(question)}))
@@ -309,21 +315,30 @@ class LocalTier:
         return found
 
     def _best(self, proposals: Sequence[Proposal], context: PlanContext) -> tuple[Proposal, int]:
-        """Return the first that breaks no rule, else the first of those that break least, and how much it breaks."""
+        """Return the first that breaks no rule, else the first of those that break least, and how much it breaks.
+
+        One that is merely doubtful is not given up for one that is far less likely.
+        """
         broken = [self._broken(each.plan, context) for each in proposals]
-        return proposals[broken.index(min(broken))], min(broken)
+        best = broken.index(min(broken))
+        if _DOUBTFUL in broken and min(broken) < _DOUBTFUL:
+            first = broken.index(_DOUBTFUL)
+            if first < best and proposals[best].confidence < _FAR * proposals[first].confidence:
+                best = first
+        return proposals[best], broken[best]
 
     def _broken(self, plan: Plan, context: PlanContext) -> int:
-        """Return 0 for a plan that keeps all rules, 1 if the validator refuses it, 2 if it cannot be what was meant.
+        """Return how little a plan can be what was meant.
 
-        The safety policy has no say: what is forbidden is refused, and nothing else done in its place.
+        0: it keeps all rules; 1: it is doubtful; 2: the validator refuses it; 3: it cannot be
+        meant. The safety policy has no say: what is forbidden is refused, and nothing else done in its place.
         """
-        robots = tuple(robot.id for robot in context.robots or ())
-        meaning = Meaning(instruction=context.instruction, robots=robots, domain=plan.domain, subtasks=plan.subtasks)
-        refused = not plan.subtasks or validate(plan, self._catalogue, robots=context.robots, site=context.site)
+        meaning = _meaning(plan, context)
         if not plan.subtasks or problems(meaning, self._catalogue) or any(contradictions(plan)):
+            return 3
+        if validate(plan, self._catalogue, robots=context.robots, site=context.site):
             return 2
-        return 1 if refused else 0
+        return _DOUBTFUL if doubts(meaning) else 0
 
     def _note(self, tokens: int, ms: float, reused: int) -> None:
         self._answered += 1
@@ -333,6 +348,11 @@ class LocalTier:
     def _retry_after_s(self) -> float:
         taken = [ms for _, ms in self._answers] or [1000.0]
         return min(60.0, max(0.1, round(self._inside * sum(taken) / len(taken) / 1000, 1)))
+
+
+def _meaning(plan: Plan, context: PlanContext) -> Meaning:
+    robots = tuple(robot.id for robot in context.robots or ())
+    return Meaning(instruction=context.instruction, robots=robots, domain=plan.domain, subtasks=plan.subtasks)
 
 
 def _proposed(answer: Answer, confidence: float, process: ModelProcess) -> Proposal:

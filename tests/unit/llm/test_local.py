@@ -92,6 +92,23 @@ async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
     assert model.asked == [False, True]
 
 
+async def test_of_a_doubtful_plan_others_are_looked_for_and_why_is_told() -> None:
+    """One without doubts is taken unless it is far less likely; a doubtful one is sure of nothing, and says why."""
+    two = PlanContext(
+        instruction="rover_1 goes to dock 3 while rover_2 does", robots=(ROVER, replace(ROVER, id="rover_2"))
+    )
+    both = [*RIGHT, "|", "goto", "w6", "w6", *RIGHT[4:]]
+    proposal = await proposed(Model([(RIGHT, 0.8), (both, 0.1)]), two)
+    assert [each.robot for each in proposal.plan.subtasks] == ["rover_1", "rover_2"]
+    for least in (0.03, 0.0):
+        model = Model([(RIGHT, 0.8), (both, least)] if least else [(RIGHT, 0.8)])
+        proposal = await proposed(model, two)
+        assert model.asked == [False, True]
+        assert [each.robot for each in proposal.plan.subtasks] == ["rover_1"]
+        assert proposal.confidence < LlmConfig().local_min_confidence
+        assert "rover_2 is named and has nothing to do" in proposal.problems
+
+
 async def test_of_plans_that_robots_cannot_do_the_one_that_is_meant_is_told() -> None:
     """The validator refuses both; the likelier one cannot be meant, and the refusal should be of what was asked for."""
     here = replace(CONTEXT, robots=(RobotInfo(id="rover_1", kind="zenoh"),))
