@@ -170,7 +170,7 @@ class FleetScreen(Screen[None], inherit_bindings=False):
             return
         store = self.store
         # Textual resumes a screen twice when it is first shown: what is as it was is not drawn again.
-        drawn = (store, store.revisions(self.shows), self.filter, self.application.theme)
+        drawn = (store, store.revisions(self.shows), self.filter, self.application.theme, self.size.width)
         with self.application.batch_update():
             if force or drawn != self._drawn:
                 self._drawn = drawn

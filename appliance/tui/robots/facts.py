@@ -14,7 +14,7 @@ from appliance.model import (
     SubtaskState,
     TaskRecord,
 )
-from appliance.tui.drawing import Cell
+from appliance.tui.drawing import Cell, hanging
 from appliance.tui.robots.map import Area, Spot
 from appliance.tui.robots.trails import TRAIL, Trails, shown_of
 from appliance.tui.safe import safe
@@ -156,8 +156,13 @@ def selected_text(robot: Robot) -> Text:
     return Text.assemble((safe(robot.info.id, 63), "bold"), " ", (state, style), mission)
 
 
-def about(robot: Robot) -> Text:
-    """Return all that is known of a robot, in lines of labelled facts."""
+def about(robot: Robot, width: int = 0) -> Text:
+    """Return all that is known of a robot, in lines of labelled facts; what is longer than a line goes on below itself.
+
+    Args:
+        robot: which one.
+        width: cells of a line; 0: however many it takes.
+    """
     info = robot.info
     state, style = state_cell(robot)
     pose = info.pose
@@ -176,7 +181,7 @@ def about(robot: Robot) -> Text:
     ]
     out = Text()
     for number, (name, value, how) in enumerate(facts):
-        out.append(f"{name:<9}", "bold").append(f"{value}\n", how)
+        out.append(f"{name:<9}", "bold").append(f"{hanging(value, ' ' * 9, width)[9:]}\n", how)
         for each in () if number else troubles(robot):
             out.append(f"▲ {each}\n", "yellow")
     if info.mission_items:

@@ -138,7 +138,7 @@ class RobotScreen(FleetScreen):
         robots = self._known.of(store)
         self._robot = robots.get(self.robot_id)
         gone = Text(f"robot {safe(self.robot_id, 63)} is not known (any more)")
-        self.say("#about", about(self._robot) if self._robot is not None else gone)
+        self.say("#about", about(self._robot, self.size.width - 2) if self._robot is not None else gone)
         self.query_one(Ground).show(robots.values(), selected=self.robot_id, view=self.view)
 
     def chosen(self) -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import cast
 
+from rich.cells import cell_len
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.widgets import Static
@@ -15,7 +16,7 @@ from appliance.errors import SwiftbotError
 from appliance.model import ContainerInfo, Phase
 from appliance.pool.api import PoolDecision
 from appliance.tui import signs
-from appliance.tui.drawing import Cell, age, clock, milliseconds, sparkline
+from appliance.tui.drawing import Cell, age, clock, hanging, milliseconds, sparkline
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grammar import plain_image
 from appliance.tui.grid import Column, Grid
@@ -96,17 +97,17 @@ def starts_text(starts: Sequence[Start], width: int) -> Text:
     )  # fmt: skip
 
 
-def decision_lines(decisions: Sequence[Decision], most: int) -> list[Text]:
-    """Return what pools decided lately and why, newest first."""
+def decision_lines(decisions: Sequence[Decision], most: int, width: int = 0) -> list[Text]:
+    """Return what pools decided lately and why, newest first; a reason longer than a line of `width` goes on below."""
     found: list[Text] = []
     for gateway, each in decisions[:most]:
         glyph, style = _SIGNS.get(each.what, ("?", "bold"))
         line = Text.assemble(
             (f"{clock(each.at_ns)} ", "dim"), (f"{glyph} {safe(each.what, 10):<7}", style),
-            f"{safe(gateway, 20):<10} {safe(each.image.rsplit('/', 1)[-1], 20):<10} ", safe(each.why, 300),
-            no_wrap=True, overflow="ellipsis",
+            f"{safe(gateway, 20):<10} {safe(each.image.rsplit('/', 1)[-1], 20):<10} ",
         )  # fmt: skip
-        found.append(line)
+        margin = " " * cell_len(line.plain)
+        found.append(line.append(hanging(safe(each.why, 300), margin, width).removeprefix(margin)))
     return found
 
 
@@ -164,8 +165,8 @@ class PoolScreen(FleetScreen):
         self.say("#starts", starts_text(tuple(store.starts), self.size.width))
         known = store.asked.get(DECISIONS)
         decisions = cast("tuple[Decision, ...]", known) if isinstance(known, tuple) else ()
-        lines = decision_lines(decisions, max(3, self.size.height // 4))
-        self.say("#decisions", Text("\n", no_wrap=True, overflow="ellipsis").join(lines))
+        lines = decision_lines(decisions, max(3, self.size.height // 4), self.size.width - 2)
+        self.say("#decisions", Text("\n").join(lines))
 
     def chosen(self) -> dict[str, str]:
         """Return the selected container with its image, and the task it serves."""

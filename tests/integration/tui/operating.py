@@ -168,3 +168,4 @@ async def operator(
             )
         )
         yield it
+        await it.until(lambda: not app.under_way)  # the fleet may have done what the UI has not yet been answered

@@ -147,7 +147,7 @@ async def test_robots(cora: Shell, client: FleetClient) -> None:
     await client.submit(TaskRequest(instruction="wait", id="c-ask", plan=plan))
     async with asyncio.timeout(PATIENCE_S):
         while not (asked := [each for each in await cora("asks") if each["task"] == "c-ask"]):
-            pass
+            await asyncio.sleep(0.1)
     await cora("answer", asked[0]["id"], "perhaps", code=4)
     assert (await cora("answer", asked[0]["id"], "yes", "--why", "I see it"))["answer"] == "yes"
     await until(client, "c-ask", lambda record: record.state.final)

@@ -61,14 +61,23 @@ async def watched(request: pytest.FixtureRequest, client: FleetClient) -> AsyncI
     for name in wanted:
         assert name in (done if BY_NAME[name].do is not None else {action for action, _ in begun}), name
     names = {app.view.operator for app in WATCHED}
-    acts, silent = await client.acts(500)
-    assert not silent
-    told = {(act.verb, act.why) for act in acts if act.by in names and act.at_ns >= began_ns and act.outcome == "done"}
-    assert {AUDITED[name] for name in wanted if name in AUDITED} <= {verb for verb, _ in told}
-    for name, why in begun:
-        if name in wanted and why:
-            # Words after `:stop` that name no robot are why.
-            assert any(verb == AUDITED[name] and known.endswith(why) for verb, known in told), (name, why)
+    verbs = {AUDITED[name] for name in wanted if name in AUDITED}
+    whys = {(AUDITED[name], why) for name, why in begun if name in wanted and why}
+    told: set[tuple[str, str]] = set()
+    try:
+        # What an order does can be seen before the gateway that it was given to has put it down.
+        async with asyncio.timeout(LONG_S):
+            while not (verbs <= {verb for verb, _ in told} and all(_is_told(each, told) for each in whys)):
+                acts, _ = await client.acts(500)
+                told = {(each.verb, each.why) for each in acts if each.by in names and each.at_ns >= began_ns
+                        and each.outcome == "done"}  # fmt: skip
+    except TimeoutError:
+        pytest.fail(f"the audit has {told}, and should have {verbs}, {whys}")
+
+
+def _is_told(order: tuple[str, str], told: set[tuple[str, str]]) -> bool:
+    """Whether an order stands in the audit. What follows `:stop` and names no robot is why as well."""
+    return any(verb == order[0] and why.endswith(order[1]) for verb, why in told)
 
 
 @pytest.fixture
