@@ -36,9 +36,17 @@ PART, ACK, REFUSED = 1, 2, 3
 MAX_BYTES = 16 * 1024
 """Longest message."""
 WINDOW = 16
-"""Parts under way at once: what a 57,600 baud radio carries in half a second."""
+"""Parts under way at once, of all messages together, before the link is known: what a 57,600 baud radio carries in half a
+second."""
+LEAST_WINDOW, MOST_WINDOW = 2, 64
+"""Of a link that needs seconds for each part, and of one that acknowledges fast."""
+QUEUE_S = 1.0
+"""An acknowledgement that takes longer has waited in a radio."""
 RESEND_S = 0.6
+"""First pause before a part is sent again; longer where the link is known to be slower (`_Pace`)."""
 LAST_RESEND_S = 4.0
+SLOWEST_S = 20.0
+"""Longest pause that a slow link is given."""
 GIVE_UP_S = 60.0
 """Without any news of a message for so long, it is not delivered: an outage may last so long."""
 ACK_WAIT_S = 0.05
@@ -55,47 +63,100 @@ class NotDelivered(Exception):  # noqa: N818 - what it says
     """A message could not be delivered, and why."""
 
 
+class _Pace:
+    """How long the other end takes to acknowledge, and what may be under way to it meanwhile.
+
+    A part that is merely still on its way must not be sent again: a radio that is slower than what it is given keeps it
+    waiting, and each repetition makes that worse. The time is estimated as TCP does (RFC 6298, with a smaller margin),
+    from parts that were sent once: of others nobody knows which was acknowledged. While there are none, each repetition
+    makes the pause longer, and the second one what is under way less.
+    """
+
+    def __init__(self) -> None:
+        self.pause_s = RESEND_S
+        """How long a part is waited for."""
+        self._window = float(WINDOW)
+        self._mean_s: float | None = None
+        self._spread_s = 0.0
+        self._longer_at = float("-inf")
+        self._guessing = False
+
+    @property
+    def window(self) -> int:
+        """How many parts may be under way."""
+        return int(self._window)
+
+    def again(self, now: float) -> None:
+        """Note that something was sent again: once for all that was sent together."""
+        if now < self._longer_at:
+            return
+        self._longer_at = now + self.pause_s
+        self.pause_s = max(self.pause_s, min(1.3 * self.pause_s, LAST_RESEND_S))
+        if self._guessing:
+            self._window = max(LEAST_WINDOW, self._window / 2)
+        self._guessing = True
+
+    def took(self, seconds: float) -> None:
+        """Take in how long one acknowledgement took."""
+        if self._mean_s is None:
+            self._mean_s, self._spread_s = seconds, seconds / 2
+        else:
+            self._spread_s += (abs(seconds - self._mean_s) - self._spread_s) / 4
+            self._mean_s += (seconds - self._mean_s) / 8
+        self.pause_s = min(SLOWEST_S, max(RESEND_S, self._mean_s + 2 * self._spread_s))
+        self._guessing = False
+        if self._mean_s < QUEUE_S:
+            self._window = min(MOST_WINDOW, self._window + 4 / self._window)
+        elif self._window > WINDOW:
+            self._window -= 1
+
+
 class _Going:
     """A message on its way out."""
 
-    def __init__(self, number: int, data: bytes, now: float) -> None:
+    def __init__(self, number: int, data: bytes, now: float, pace: _Pace) -> None:
         self.number = number
+        self._pace = pace
         self.crc = zlib.crc32(data)
         self.parts = [data[at : at + PART_BYTES] for at in range(0, len(data), PART_BYTES)] or [b""]
         self.missing = dict.fromkeys(range(len(self.parts)), now)
         """Index of each part not known to have arrived -> when it is to be sent (again)."""
-        self.pause_s = RESEND_S
+        self._sent: dict[int, float | None] = {}
+        """When a part was sent, None when more than once."""
         self.heard_at = now
         self.begun = False
 
-    def due(self, now: float) -> list[bytes]:
-        """Return the payloads to send now, within the window."""
+    def due(self, now: float, window: int) -> list[bytes]:
+        """Return the payloads to send now, of the first `window` parts that are missing."""
         found: list[bytes] = []
-        for index, at in itertools.islice(self.missing.items(), WINDOW):
+        again = False
+        for index, at in itertools.islice(self.missing.items(), window):
             if at <= now:
-                self.missing[index] = now + self.pause_s
+                again = again or index in self._sent
+                self._sent[index] = None if index in self._sent else now
+                self.missing[index] = now + self._pace.pause_s
                 found.append(_pack(PART, self.number, index, len(self.parts), self.crc, self.parts[index]))
-        if found:
-            self.pause_s = min(1.3 * self.pause_s, LAST_RESEND_S)
+        if again:
+            self._pace.again(now)
         return found
 
     def acknowledged(self, first: int, bitmap: bytes, now: float) -> bool:
         """Take in what the other end has; whether that is all."""
-        if first >= len(self.parts):
-            return True
-        before = len(self.missing)
+        latest: float | None = None
+        """When the last of those that have arrived was sent, as far as that is known."""
         for index in range(min(len(self.parts), first + 8 * len(bitmap))):
             place = index - first
             if place < 0 or bitmap[place // 8] >> place % 8 & 1:
-                self.missing.pop(index, None)
+                if self.missing.pop(index, None) is not None and (at := self._sent.get(index)) is not None:
+                    latest = at if latest is None else max(latest, at)
             else:
                 # It may have had it and forgotten. Where this account was merely overtaken by a later one nothing is
                 # sent in vain: that takes it out again, or the next one does before the part is due.
-                self.missing.setdefault(index, now + self.pause_s)
+                self.missing.setdefault(index, now + self._pace.pause_s)
         self.heard_at = now
-        if len(self.missing) < before:
-            self.pause_s = RESEND_S
-        return False
+        if latest is not None:
+            self._pace.took(now - latest)
+        return first >= len(self.parts)
 
 
 class _Coming:
@@ -119,6 +180,7 @@ class Channel:
     def __init__(self, new_number: Callable[[], int], *, max_bytes: int = MAX_BYTES) -> None:
         self._new_number = new_number
         self._max_bytes = max_bytes
+        self._pace = _Pace()
         self._going: OrderedDict[int, _Going] = OrderedDict()
         self._coming: OrderedDict[int, _Coming] = OrderedDict()
         self._done: OrderedDict[int, tuple[int, int]] = OrderedDict()
@@ -140,7 +202,7 @@ class Channel:
         if len(self._going) >= MAX_GOING:
             raise NotDelivered(f"{MAX_GOING} messages wait to be delivered already")
         number = self._new_number() & 0xFFFF_FFFF
-        self._going[number] = _Going(number, data, now)
+        self._going[number] = _Going(number, data, now, self._pace)
         return number
 
     def going(self, number: int) -> bool:
@@ -153,18 +215,25 @@ class Channel:
         for number in [number for number, at in self._acks.items() if at <= now]:
             del self._acks[number]
             found += self._account(number)
-        under_way = 0
+        under_way: list[_Going] = []
         for number, message in list(self._going.items()):
             # Those that wait for others are not given up while the other end takes these.
             heard_at = message.heard_at if message.begun else max(message.heard_at, self._heard_at)
             if now - heard_at > GIVE_UP_S:
                 del self._going[number]
                 self._fail(number, f"nothing was heard for {GIVE_UP_S:g} s")
-            elif under_way < MAX_COMING:
-                under_way += 1
+            elif len(under_way) < MAX_COMING:
+                under_way.append(message)
                 if not message.begun:
                     message.begun, message.heard_at = True, now
-                found += message.due(now)
+        # Each has its share of the window; what a short one does not need is for the longer ones.
+        left = self._pace.window
+        for others, message in zip(
+            range(len(under_way), 0, -1), sorted(under_way, key=lambda each: len(each.missing)), strict=True
+        ):
+            share = left // others
+            found += message.due(now, share)
+            left -= min(share, len(message.missing))
         for number, coming in list(self._coming.items()):
             if now - coming.heard_at > GIVE_UP_S:
                 del self._coming[number]

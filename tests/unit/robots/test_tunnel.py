@@ -14,7 +14,9 @@ from appliance.robots.mavlink.tunnel import (
     MAX_COMING,
     MAX_GOING,
     MAX_PAYLOAD,
+    MOST_WINDOW,
     PART,
+    PART_BYTES,
     Channel,
     NotDelivered,
 )
@@ -264,3 +266,67 @@ def test_a_changed_message_is_not_taken() -> None:
     for payload in radio.ends[1].due(1.0):
         radio.ends[0].take(payload, 1.0)
     assert radio.ends[0].failed == {number: "its checksum is wrong"}
+
+
+class Slow:
+    """Two ends and a radio of so many bytes a second, which keeps all that it is given until it has sent it."""
+
+    def __init__(self, bytes_per_s: float) -> None:
+        self.bytes_per_s = bytes_per_s
+        self.now = 0.0
+        numbers = itertools.count(1)
+        self.ends = (Channel(lambda: next(numbers)), Channel(lambda: next(numbers)))
+        self.free_at = [0.0, 0.0]
+        self.air: list[tuple[float, int, bytes]] = []
+        self.got: list[bytes] = []
+        self.parts = 0
+        self.most_waiting = 0
+
+    def step(self) -> None:
+        """Let 50 ms pass."""
+        self.now += 0.05
+        for side in (0, 1):
+            for payload in self.ends[side].due(self.now):
+                self.parts += side == 0
+                # MAVLink 2 puts 12 bytes around a frame, and TUNNEL 5 before its payload.
+                self.free_at[side] = max(self.now, self.free_at[side]) + (17 + len(payload)) / self.bytes_per_s
+                self.air.append((self.free_at[side] + 0.1, 1 - side, payload))
+        landed = [each for each in self.air if each[0] <= self.now]
+        self.air = [each for each in self.air if each[0] > self.now]
+        self.most_waiting = max(self.most_waiting, sum(side == 1 for _, side, _ in self.air))
+        for _, side, payload in landed:
+            whole = self.ends[side].take(payload, self.now)
+            if whole is not None and side == 1:
+                self.got.append(whole)
+
+
+@pytest.mark.parametrize("baud", [57_600, 9_600, 4_800, 1_200])
+def test_a_slow_radio_is_not_buried(baud: int) -> None:
+    """However slow it is, and however many messages wait: each arrives, and repetitions do not fill the radio."""
+    radio = Slow(baud / 10)
+    chance = random.Random(3)  # noqa: S311 - no secret
+    size = 4000 if baud > 2_000 else 1000
+    wanted = [chance.randbytes(size) for _ in range(2 * MAX_COMING)]
+    sent = [radio.ends[0].send(data, 0.0) for data in wanted]
+    needed = len(wanted) * -(-size // PART_BYTES)
+    ideal_s = needed * 145 / radio.bytes_per_s
+    while any(radio.ends[0].going(number) for number in sent):
+        radio.step()
+        assert radio.now < 3 * ideal_s + 10.0
+    assert not radio.ends[0].failed
+    assert sorted(radio.got) == sorted(wanted)
+    assert radio.parts <= 3 * needed
+    assert radio.most_waiting <= 2 * MOST_WINDOW
+
+
+def test_a_short_message_does_not_wait_for_a_long_one() -> None:
+    """Messages share what may be under way: a word is there before a long text that was begun earlier."""
+    radio = Slow(576.0)
+    long = radio.ends[0].send(bytes(MAX_BYTES), 0.0)
+    radio.step()
+    short = radio.ends[0].send(b"stop", radio.now)
+    while radio.ends[0].going(short):
+        radio.step()
+        assert radio.now < 20.0
+    assert radio.got == [b"stop"]
+    assert radio.ends[0].going(long)
