@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, cast
 
-from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel, NotDelivered
+from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, SILENT, Channel, NotDelivered
 from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskClient, ZenohTaskRejected
 
 __all__ = [
@@ -215,7 +215,7 @@ class TaskClient:
                     return news
             if number is not None and number in self._channel.failed:
                 why = self._channel.failed.pop(number)
-                if why.startswith("nothing was heard"):
+                if why == SILENT:
                     raise TimeoutError(f"the gateway does not answer: {why}")
                 raise TaskRejected(why, code="payload")
             if time.monotonic() > until:

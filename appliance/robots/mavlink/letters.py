@@ -12,19 +12,21 @@ and back (`to`: the op that is answered):
 
     {"op": "accepted", "to", "id", "state"}                 durable on its replicas
     {"op": "rejected", "to", "id", "code", "message", "remedy", "retry"}
-    {"op": "news", "id", "state", "done", "total", "message"}   on each change, until a final state; then also
-                                                            "results", by subtask, as far as 8 KiB hold them
+    {"op": "news", "id", "state", "done", "total", "message"}   how it stands now, on a change, until a final state;
+                                                            then also "results", by subtask, as far as 8 KiB hold
+                                                            them. What changes before the last news have arrived is
+                                                            told as one
 """
 
 import asyncio
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import structlog
-from msgspec import Struct, field
+from msgspec import Meta, Struct, field
 
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest, encode
@@ -33,7 +35,7 @@ from appliance.robots.intake import own
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.requests import STATION
-from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel, NotDelivered
+from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, SILENT, Channel, NotDelivered
 
 log = structlog.get_logger(__name__)
 
@@ -45,6 +47,10 @@ MAX_FOLLOWED = 1000
 """Tasks whose senders are told how they go on; the one asked for longest ago is forgotten first."""
 MOST_RESULTS = 8 * 1024
 """Bytes of results that are told; what is larger is looked up by the task's id."""
+MOST_WORDS = 700
+"""Characters of a reason: two of them fit into a message however they are written in JSON."""
+MOST_NEWS = 256
+"""Tasks whose news wait for one sender; beyond, the oldest are left to its asking."""
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
 
 
@@ -52,7 +58,7 @@ class Letter(Struct, frozen=True, kw_only=True):
     """What a sender wants. Fields of later versions are ignored."""
 
     op: Literal["submit", "follow", "cancel"]
-    id: str
+    id: Annotated[str, Meta(max_length=MOST_WORDS)]
     instruction: str = ""
     request: TaskRequest | None = None
 
@@ -82,6 +88,35 @@ class _Sender:
         """Whose its tasks are: the vehicle that speaks, not one that it addresses."""
         self.reply = reply
         self.channel = Channel(lambda: secrets.randbits(32))
+        self.news: OrderedDict[str, bytes] = OrderedDict()
+        """Task -> what is to be told of it: the last, where more has changed since it could be told."""
+        self._telling: dict[str, int] = {}
+        """Task -> the message by which it is being told."""
+
+    def tell(self, task: str, said: bytes, now: float) -> None:
+        """Tell news of a task, now or as soon as there is room and the last ones have arrived."""
+        self.news[task] = said
+        if len(self.news) > MOST_NEWS:
+            self.news.popitem(last=False)
+        self.go_on(now)
+
+    def go_on(self, now: float) -> None:
+        """Send what can be sent of the news that wait."""
+        self._telling = {task: number for task, number in self._telling.items() if self.channel.going(number)}
+        for task in [task for task in self.news if task not in self._telling]:
+            try:
+                self._telling[task] = self.channel.send(self.news[task], now)
+            except NotDelivered:
+                return
+            del self.news[task]
+
+    def lost(self) -> dict[int, str]:
+        """Take out what could not be delivered, and why. What waits for one that is not there goes with it: it will ask."""
+        failed = dict(self.channel.failed)
+        self.channel.failed.clear()
+        if SILENT in failed.values():
+            self.news.clear()
+        return failed
 
 
 class LetterDesk:
@@ -132,6 +167,8 @@ class LetterDesk:
         """Send what is due; to be called some twenty times a second."""
         now = self._clock()
         for (system, component), sender in self._senders.items():
+            if sender.news:
+                sender.go_on(now)
             for payload in sender.channel.due(now):
                 sender.reply(
                     dialect.make(
@@ -143,11 +180,8 @@ class LetterDesk:
                         payload=list(payload.ljust(MAX_PAYLOAD, b"\0")),
                     )
                 )
-            for number in list(sender.channel.failed):
-                log.info(
-                    "an answer over MAVLink was not delivered", to=sender.name, reason=sender.channel.failed[number]
-                )
-                del sender.channel.failed[number]
+            for reason in sender.lost().values():
+                log.info("an answer over MAVLink was not delivered", to=sender.name, reason=reason)
 
     def follows(self, task: str) -> bool:
         """Whether somebody is told how this task goes on."""
@@ -165,7 +199,7 @@ class LetterDesk:
                 del found[key]  # forgotten: when it speaks again it asks
             elif said != told:
                 found[key] = said
-                self._send(sender, said)
+                sender.tell(record.id, said, self._clock())
         if record.state.final or not found:
             del self._followed[record.id]
 
@@ -176,7 +210,9 @@ class LetterDesk:
             letter = msgspec.json.decode(data, type=Letter)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self._count("tunnel_malformed")
-            self._say(sender, Answer(op="rejected", id="", code="payload", message=f"not understood: {error}"))
+            self._say(
+                sender, Answer(op="rejected", id="", code="payload", message=f"not understood: {error}"[:MOST_WORDS])
+            )
             return
         if len(self._at_work) >= MAX_AT_WORK:
             self._reject(sender, letter, RefusedError("too many messages are being carried out"))
@@ -226,24 +262,23 @@ class LetterDesk:
     def _reject(self, sender: _Sender, letter: Letter, error: SwiftbotError) -> None:
         passing = isinstance(error, _PASSING)
         self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
-        log.warning("what was asked by MAVLink is refused", sender=sender.name, op=letter.op, reason=str(error))
+        log.warning(
+            "what was asked by MAVLink is refused", sender=sender.name, op=letter.op, reason=str(error)[:MOST_WORDS]
+        )
         answer = Answer(
             op="rejected",
             to=letter.op,
             id=letter.id,
             code=error.code,
-            message=error.message,
-            remedy=error.remedy,
+            message=error.message[:MOST_WORDS],
+            remedy=error.remedy[:MOST_WORDS],
             retry=passing,
         )
         self._say(sender, answer)
 
     def _say(self, sender: _Sender, answer: Answer) -> None:
-        self._send(sender, encode(answer))
-
-    def _send(self, sender: _Sender, data: bytes) -> None:
         try:
-            sender.channel.send(data, self._clock())
+            sender.channel.send(encode(answer), self._clock())
         except NotDelivered as error:
             log.warning("an answer over MAVLink was not sent", to=sender.name, reason=str(error))
 
@@ -256,7 +291,7 @@ def _news(record: TaskRecord) -> Answer:
     if record.state.final:
         left = MOST_RESULTS
         for each in record.subtasks:
-            left -= len(encode(each.result)) if each.result else 0
+            left -= len(encode({each.subtask.id: each.result})) if each.result else 0
             if each.result and left >= 0:
                 results[each.subtask.id] = each.result
     return Answer(
@@ -265,6 +300,6 @@ def _news(record: TaskRecord) -> Answer:
         state=record.state,
         done=sum(each.state.final for each in record.subtasks),
         total=len(record.subtasks),
-        message=record.failure.message[:1000] if record.failure else "",
+        message=record.failure.message[:MOST_WORDS] if record.failure else "",
         results=results,
     )

@@ -36,8 +36,8 @@ PART, ACK, REFUSED = 1, 2, 3
 MAX_BYTES = 16 * 1024
 """Longest message."""
 WINDOW = 16
-"""Parts under way at once, of all messages together, before the link is known: what a 57,600 baud radio carries in half a
-second."""
+"""Parts under way at once, of all messages together, on a link that is not known yet: what a radio of 57,600 baud carries
+in half a second."""
 LEAST_WINDOW, MOST_WINDOW = 2, 64
 """Of a link that needs seconds for each part, and of one that acknowledges fast."""
 QUEUE_S = 1.0
@@ -49,6 +49,8 @@ SLOWEST_S = 20.0
 """Longest pause that a slow link is given."""
 GIVE_UP_S = 60.0
 """Without any news of a message for so long, it is not delivered: an outage may last so long."""
+SILENT = f"nothing was heard for {GIVE_UP_S:g} s"
+"""Why it was not."""
 ACK_WAIT_S = 0.05
 """Parts that come together are acknowledged together."""
 MAX_COMING = 4
@@ -221,7 +223,7 @@ class Channel:
             heard_at = message.heard_at if message.begun else max(message.heard_at, self._heard_at)
             if now - heard_at > GIVE_UP_S:
                 del self._going[number]
-                self._fail(number, f"nothing was heard for {GIVE_UP_S:g} s")
+                self._fail(number, SILENT)
             elif len(under_way) < MAX_COMING:
                 under_way.append(message)
                 if not message.begun:

@@ -9,11 +9,22 @@ import msgspec
 import pytest
 
 from appliance.errors import NotFoundError, RefusedError, SwiftbotError
-from appliance.model import Plan, Provenance, Subtask, TaskRecord, TaskRequest, TaskState, Tier
+from appliance.model import (
+    Failure,
+    Plan,
+    Provenance,
+    Subtask,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskRequest,
+    TaskState,
+    Tier,
+)
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
 from appliance.robots.mavlink.letters import Answer, LetterDesk
-from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, Channel
+from appliance.robots.mavlink.tunnel import GIVE_UP_S, MAX_GOING, MAX_PAYLOAD, PAYLOAD_TYPE, Channel
 
 pytestmark = pytest.mark.anyio
 
@@ -139,6 +150,93 @@ async def test_news_until_the_end() -> None:
     assert [each.state for each in air.answers if each.op == "news"] == ["running", "succeeded"]
 
 
+async def test_the_end_is_told_after_an_outage_with_many_changes() -> None:
+    """What changed while the robot was not heard is told as it stands now: steps on the way do not crowd out the end."""
+    air = Air()
+    assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
+    air.loss = 1.0
+    steps = 60
+    for done in range(steps + 1):
+        subtasks = tuple(
+            SubtaskRecord(
+                subtask=Subtask(id=f"s{number}", skill="goto"),
+                state=SubtaskState.SUCCEEDED if number < done else SubtaskState.WAITING,
+            )
+            for number in range(steps)
+        )
+        state = TaskState.SUCCEEDED if done == steps else TaskState.RUNNING
+        air.desk.news(TaskRecord(id="t1", instruction="", state=state, subtasks=subtasks, sequence=2 + done))
+        for _ in range(10):
+            await air.step()
+    air.loss = 0.0
+    while not (told := [each for each in air.answers if each.op == "news"]) or told[-1].state != "succeeded":
+        await air.step()
+        assert air.now < 90
+    assert [each.done for each in told] == sorted(each.done for each in told)
+    assert len(told) <= 3, "what has been overtaken is not told"
+    assert not air.desk.follows("t1")
+
+
+async def test_ends_of_many_tasks_at_once() -> None:
+    """More tasks of one robot end in one moment than messages may wait: it hears of each."""
+    air = Air()
+    names = [f"t{number}" for number in range(3 * MAX_GOING)]
+    for name in names:
+        await air.ask(letter("submit", name, "go home"))
+    for name in names:
+        air.desk.news(TaskRecord(id=name, instruction="", state=TaskState.FAILED, sequence=9))
+    while len({each.id for each in air.answers if each.op == "news"}) < len(names):
+        await air.step()
+        assert air.now < 120
+
+
+async def test_news_of_nobody_are_not_kept() -> None:
+    """A robot that is not heard any more costs no memory and no air: when it comes back it asks."""
+    air = Air()
+    for number in range(20):
+        await air.ask(letter("submit", f"t{number}", "go home"))
+    air.loss = 1.0
+    for number in range(20):
+        for done in range(3):
+            running = TaskRecord(id=f"t{number}", instruction="", state=TaskState.RUNNING, sequence=3 + done)
+            air.desk.news(msgspec.structs.replace(running, failure=Failure(code="x", message=f"step {done}")))
+    until = air.now + 2 * GIVE_UP_S + 5.0
+    while air.now < until:
+        await air.step()
+    (sender,) = air.desk._senders.values()
+    assert not sender.channel._going
+    assert not sender.news
+
+
+async def test_results_beyond_a_message_are_left_out() -> None:
+    """However long the names of subtasks and what is told of a failure: the end of a task fits into a message."""
+    air = Air()
+    assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
+    subtasks = tuple(
+        SubtaskRecord(subtask=Subtask(id=f"{number:064}", skill="goto"), result={"n": 1}) for number in range(1000)
+    )
+    air.desk.news(
+        TaskRecord(
+            id="t1", instruction="", state=TaskState.FAILED, subtasks=subtasks, failure=Failure(code="x", message="\x01" * 5000),
+            sequence=9,
+        )
+    )  # fmt: skip
+    while not (told := [each for each in air.answers if each.op == "news"]):
+        await air.step()
+        assert air.now < 60
+    assert told[0].state == "failed"
+    assert told[0].total == 1000
+
+
+@pytest.mark.parametrize("length", [1, 20_000])
+async def test_a_refusal_of_any_length_is_told(length: int) -> None:
+    """A reason that no message holds is cut; the robot is not left without an answer."""
+    air = Air()
+    air.error = RefusedError("no" * length, remedy="wait" * length)
+    answer = await air.ask(letter("submit", "t1", "go"))
+    assert (answer.op, answer.code, answer.message[:2], answer.remedy[:4]) == ("rejected", "refused", "no", "wait")
+
+
 async def test_a_whole_request_comes_with_its_plan() -> None:
     """A structured task is the sender's own, whomever it names, and where its plan came from is not for it to say."""
     air = Air()
@@ -241,7 +339,11 @@ async def test_refusals_have_their_reason() -> None:
     assert (await Air(tasks=False).ask(letter("submit", "t1", "go"))).message == "this gateway takes no tasks"
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff", b"[1]", b'{"op":"fly","id":"x"}', b'{"op":"submit"}', b"[" * 5000])
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\xff", b"[1]", b'{"op":"fly","id":"x"}', b'{"op":"submit"}', b"[" * 5000,
+     b'{"op":"cancel","id":"%s"}' % (b"x" * 16_000)],
+)  # fmt: skip
 async def test_messages_that_are_none(data: bytes) -> None:
     """What is no message is answered so and counted; the next one is taken."""
     air = Air()
