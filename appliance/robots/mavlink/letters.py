@@ -111,7 +111,7 @@ class _Sender:
             del self.news[task]
 
     def lost(self) -> dict[int, str]:
-        """Take out what could not be delivered, and why. What waits for one that is not there goes with it: it will ask."""
+        """Take out what could not be delivered, and why. What waits for one that is not there goes too: it will ask."""
         failed = dict(self.channel.failed)
         self.channel.failed.clear()
         if SILENT in failed.values():

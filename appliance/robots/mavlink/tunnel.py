@@ -36,8 +36,8 @@ PART, ACK, REFUSED = 1, 2, 3
 MAX_BYTES = 16 * 1024
 """Longest message."""
 WINDOW = 16
-"""Parts under way at once, of all messages together, on a link that is not known yet: what a radio of 57,600 baud carries
-in half a second."""
+"""Parts under way at once, of all messages together, on a link that is not known yet: what a radio of 57,600 baud
+carries in half a second."""
 LEAST_WINDOW, MOST_WINDOW = 2, 64
 """Of a link that needs seconds for each part, and of one that acknowledges fast."""
 QUEUE_S = 1.0

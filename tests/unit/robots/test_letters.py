@@ -151,7 +151,7 @@ async def test_news_until_the_end() -> None:
 
 
 async def test_the_end_is_told_after_an_outage_with_many_changes() -> None:
-    """What changed while the robot was not heard is told as it stands now: steps on the way do not crowd out the end."""
+    """What changed while a robot was not heard is told as it stands now: steps on the way do not crowd out the end."""
     air = Air()
     assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
     air.loss = 1.0
@@ -215,12 +215,10 @@ async def test_results_beyond_a_message_are_left_out() -> None:
     subtasks = tuple(
         SubtaskRecord(subtask=Subtask(id=f"{number:064}", skill="goto"), result={"n": 1}) for number in range(1000)
     )
+    failure = Failure(code="x", message="\x01" * 5000)
     air.desk.news(
-        TaskRecord(
-            id="t1", instruction="", state=TaskState.FAILED, subtasks=subtasks, failure=Failure(code="x", message="\x01" * 5000),
-            sequence=9,
-        )
-    )  # fmt: skip
+        TaskRecord(id="t1", instruction="", state=TaskState.FAILED, subtasks=subtasks, failure=failure, sequence=9)
+    )
     while not (told := [each for each in air.answers if each.op == "news"]):
         await air.step()
         assert air.now < 60
