@@ -8,6 +8,7 @@ Pure state with the clock passed in.
 
 import re
 from collections import deque
+from typing import Any
 
 import msgspec
 from msgspec import Struct
@@ -19,12 +20,18 @@ from appliance.record.facts import Incident, LoggedMessage, Trigger
 EVERY = "every"
 """Recorder's name in a trigger that is meant for all recorders."""
 _FAILED = re.compile(rb'"state"\s*:\s*"failed"')
-_FAILSAFE = re.compile(rb'"failsafe\w*"\s*:\s*(?!false|null|""|\[\]|0[,}])')
+_FAILSAFE = b"failsafe"
+EACH = 300
+"""Bytes that keeping a message takes beside its payload and its key, as measured."""
 _MOST_REMEMBERED = 10_000
 
 
 class _State(Struct):
     state: str = ""
+
+
+class _Robot(Struct):
+    failsafe: Any = None
 
 
 class Triggers:
@@ -57,7 +64,7 @@ class Triggers:
                 message, "task failed" if _FAILED.search(message.payload) and _has_failed(message) else ""
             )
         if kind == "robot":
-            return self._once(message, "failsafe" if _FAILSAFE.search(message.payload) else "")
+            return self._once(message, "failsafe" if _FAILSAFE in message.payload and _has_failsafe(message) else "")
         if kind == "stop":
             return self._once(message, "" if message.deleted else "stop")  # told again by the gateway that keeps it
         try:
@@ -84,16 +91,24 @@ def _has_failed(message: LoggedMessage) -> bool:
         return False
 
 
+def _has_failsafe(message: LoggedMessage) -> bool:
+    """Whether the robot says so, and not something in it."""
+    try:
+        return bool(msgspec.json.decode(message.payload, type=_Robot).failsafe)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return False
+
+
 def _incident(message: LoggedMessage, reason: str, detail: str = "") -> Incident:
     return Incident(reason=reason, detail=detail, key=message.key, at_ns=message.at_ns)
 
 
 class Ring:
-    """The messages of the last seconds, bounded by their bytes too; the oldest go first and are no loss."""
+    """The messages of the last seconds, bounded by the memory they take too; the oldest go first and are no loss."""
 
-    def __init__(self, *, seconds: float, payload_bytes: int) -> None:
+    def __init__(self, *, seconds: float, most_bytes: int) -> None:
         self._seconds = seconds
-        self._most_bytes = payload_bytes
+        self._most_bytes = most_bytes
         self._held: deque[tuple[float, LoggedMessage]] = deque()
         self._bytes = 0
 
@@ -104,13 +119,13 @@ class Ring:
     def hold(self, message: LoggedMessage, now: float) -> None:
         """Take a message, and let go of what is too old or too much."""
         self._held.append((now, message))
-        self._bytes += len(message.payload) + len(message.key)
+        self._bytes += _size(message)
         self._let_go(now)
 
     def _let_go(self, now: float) -> None:
         while self._held and (now - self._held[0][0] > self._seconds or self._bytes > self._most_bytes):
             _, gone = self._held.popleft()
-            self._bytes -= len(gone.payload) + len(gone.key)
+            self._bytes -= _size(gone)
 
     def release(self, now: float) -> tuple[list[LoggedMessage], float]:
         """Return all that is held, in order, and how many seconds back it goes; the ring is empty then."""
@@ -122,6 +137,10 @@ class Ring:
         return out, back_s
 
 
+def _size(message: LoggedMessage) -> int:
+    return len(message.payload) + len(message.key) + EACH
+
+
 class Gate:
     """Lets messages through to the log: all of them, or those around incidents.
 
@@ -129,13 +148,13 @@ class Gate:
         always: write everything.
         before_s: seconds kept for an incident.
         after_s: seconds that are written after the last one.
-        ring_bytes: payload bytes held at most.
+        ring_bytes: memory that what is held may take.
     """
 
     def __init__(self, *, always: bool, before_s: float, after_s: float, ring_bytes: int) -> None:
         self.always = always
         self._after_s = after_s
-        self._ring = Ring(seconds=before_s, payload_bytes=ring_bytes)
+        self._ring = Ring(seconds=before_s, most_bytes=ring_bytes)
         self._until = float("-inf")
         self.incidents = 0
         self.last = ""

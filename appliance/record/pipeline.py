@@ -23,7 +23,6 @@ from appliance.record.writer import LogWriter
 MOST_KEYS = 50_000
 """Keys whose plan is remembered; beyond, all are worked out anew. Each task has some of its own."""
 _PLAN = b'"plan"'
-_PLANNING = ("planned", "replanned", "rebound", "substituted", "accepted")
 
 
 class _Way(Struct, frozen=True):
@@ -38,7 +37,6 @@ class _Way(Struct, frozen=True):
 class _Planned(Struct):
     task: str = ""
     sequence: int = 0
-    kind: str = ""
     plan: msgspec.Raw = msgspec.Raw()
 
 
@@ -117,7 +115,7 @@ class Pipeline:
             told = msgspec.json.decode(message.payload, type=_Planned)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return
-        if told.kind in _PLANNING and bytes(told.plan) not in (b"", b"null"):
+        if bytes(told.plan) not in (b"", b"null"):
             name = f"plan-{told.task[:80]}-{told.sequence}.json"
             self.writer.attach(Attached(name, "application/json", bytes(told.plan)))
 

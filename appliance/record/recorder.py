@@ -66,7 +66,7 @@ class Intake:
         """Add a message; False when it was dropped."""
         size = len(message.payload)
         with self._lock:
-            full = len(self._waiting) >= self._most or self._bytes + size > self._most_bytes
+            full = not self._fits(1, size)
             if not full:
                 self._waiting.append(message)
                 self._bytes += size
@@ -77,23 +77,27 @@ class Intake:
 
     def put_all(self, messages: list[LoggedMessage]) -> None:
         """Add messages in order. A burst waits a moment for room; what does not fit then is dropped and counted."""
-        self._make_way(messages)
-        sizes = sum(len(each.payload) for each in messages)
+        size = sum(len(each.payload) for each in messages)
+        self._make_way(len(messages), size)
         with self._lock:
-            fits = len(self._waiting) + len(messages) <= self._most and self._bytes + sizes <= self._most_bytes
+            fits = self._fits(len(messages), size)
             if fits:
                 self._waiting += messages
-                self._bytes += sizes
+                self._bytes += size
         if fits:
             self._some.set()
         else:
             for each in messages:
                 self.put(each)
 
-    def _make_way(self, messages: list[LoggedMessage]) -> None:
+    def _fits(self, messages: int, size: int) -> bool:
+        """Whether there is room for so many, of so many bytes together; under the lock."""
+        return len(self._waiting) + messages <= self._most and self._bytes + size <= self._most_bytes
+
+    def _make_way(self, messages: int, size: int) -> None:
         """Wait until the writer has taken what is there, unless it does not come round: then nothing waits for it."""
         with self._lock:
-            if len(self._waiting) + len(messages) <= self._most or self._stuck:
+            if self._stuck or not self._waiting or self._fits(messages, size):
                 return
             self._room.clear()
         if not self._room.wait(PATIENCE_S):

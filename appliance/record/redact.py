@@ -1,8 +1,9 @@
 """Secrets never reach a log: fields that are named so, and values that are known to be secret.
 
 A log is copied, mailed and opened in other people's tools, so what must stay here is taken out before it is written:
-the value of every JSON field whose name says that it is a secret, wherever it stands, and every secret that this
-process was told of (its configuration, its environment), in whatever payload it turns up. What is taken out is replaced
+the value of every JSON field whose name says that it is a secret, wherever it stands (in a text that is JSON itself,
+too), and every secret that this process was told of (its configuration, its environment), in whatever payload it turns
+up. What is taken out is replaced
 by `REDACTED`, so that a reader sees that there was something. Raw frames of robots are not looked into by name: they
 must stay byte for byte; a known secret is taken out of them too, at the cost of the frame.
 
@@ -12,6 +13,7 @@ Names are compared word by word (`apiKey`, `api_key` and `API-KEY` are the words
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, cast
 
@@ -30,17 +32,30 @@ _ALONE = frozenset(
 _LAST = frozenset({"token", "bearer", "pwd"})
 _BEFORE_KEY = frozenset({"api", "private", "signing", "access", "encryption", "auth", "shared", "secret"})
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_FIELD = re.compile(rb'"((?:[^"\\]|\\.){1,120})"(\s*:\s*)("(?:[^"\\]|\\.)*"?|[^,}\]\s]+)')
+_SHORT_NAME = 80
+_NAME = re.compile(rb'"((?:[^"\\]|\\.){1,120})"\s*:\s*')
+_SCALAR = re.compile(rb'"(?:[^"\\]|\\.)*"?|[^,}\]\s]*')
+_STRING_OR_BRACKET = re.compile(rb'"(?:[^"\\]|\\.)*"?|[{}\[\]]')
+_NO_JSON = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError)
+_NOTHING = (b"", b'""', b"null", b"false")
 
 
 def names_a_secret(name: str) -> bool:
     """Whether a field or variable of that name holds a secret."""
+    return _known_name(name) if len(name) <= _SHORT_NAME else _by_its_words(name)
+
+
+def _by_its_words(name: str) -> bool:
     words = [each.lower() for each in _WORD.findall(name)]
     if not words:
         return False
     if not _ALONE.isdisjoint(words) or words[-1] in _LAST:
         return True
     return any(word in ("key", "keys") and before in _BEFORE_KEY for before, word in pairwise(words))
+
+
+_known_name = lru_cache(4096)(_by_its_words)
+"""Messages have the same few names again and again."""
 
 
 def without_secrets(value: Any) -> Any:
@@ -54,6 +69,10 @@ def without_secrets(value: Any) -> Any:
         }
     if isinstance(value, list | tuple):
         return [without_secrets(each) for each in cast("list[Any]", value)]
+    if isinstance(value, str) and '"' in value:
+        text = value.encode("utf-8", "surrogatepass")
+        clean = _emptied(text) if _may_name_one(text) else text
+        return value if clean is text else clean.decode("utf-8", "surrogatepass")
     return value
 
 
@@ -103,25 +122,77 @@ class Redactor:
 
         One without any comes back byte for byte. One that is no JSON is treated as text that may look like it.
         """
-        clean = payload
-        if _may_name_one(payload):
-            try:
-                value = msgspec.json.decode(payload)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-                clean = _FIELD.sub(_blank, payload)
-            else:
-                try:
-                    kept = without_secrets(value)
-                    clean = payload if kept == value else msgspec.json.encode(kept)
-                except RecursionError:
-                    clean = _FIELD.sub(_blank, payload)
-        if clean is not payload:
-            self.count += 1
-            before = self.count
-            clean = self.text(clean)
-            self.count = before
-            return clean
-        return self.text(payload)
+        clean = _emptied(payload) if _may_name_one(payload) else payload
+        if clean is payload and self._known is not None and b"\\" in payload:
+            clean = self._unescaped(payload, self._known)
+        if clean is payload:
+            return self.text(payload)
+        self.count += 1
+        return clean if self._known is None else self._known.sub(REDACTED.encode(), clean)
+
+    def _unescaped(self, payload: bytes, known: re.Pattern[bytes]) -> bytes:
+        """Return JSON in which known secrets stand as they are looked for; the payload itself where there are none.
+
+        There are many ways to write one text: any letter may be escaped.
+        """
+        try:
+            plain = msgspec.json.encode(msgspec.json.decode(payload))
+        except _NO_JSON:
+            return payload
+        return plain if known.search(plain) else payload
+
+
+def _emptied(payload: bytes) -> bytes:
+    """Return JSON, or what looks like it, without what fields hold whose names say so; itself where there are none."""
+    try:
+        value = msgspec.json.decode(payload)
+        kept = without_secrets(value)
+        plain = msgspec.json.encode(kept)
+    except _NO_JSON:
+        return _blanked(payload)
+    if kept != value:
+        return plain
+    # A name may stand twice in an object, and only the last counts. Where all is written as we write it, none does.
+    return payload if plain == payload or _blanked(payload) is payload else plain
+
+
+def _blanked(payload: bytes) -> bytes:
+    """Return text, as far as it is like JSON, with the values of fields replaced that are named as secrets are."""
+    out: list[bytes] = []
+    at = 0
+    for match in _NAME.finditer(payload):
+        begin = match.end()
+        if match.start() < at or not names_a_secret(_plain(match.group(1))):
+            continue
+        end = _end_of_value(payload, begin)
+        if payload[begin:end] not in _NOTHING:
+            out += (payload[at:begin], b'"%s"' % REDACTED.encode())
+            at = end
+    return b"".join((*out, payload[at:])) if out else payload
+
+
+def _plain(name: bytes) -> str:
+    """Return a name without its escapes."""
+    try:
+        return msgspec.json.decode(b'"%s"' % name, type=str)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return name.decode("utf-8", "replace")
+
+
+def _end_of_value(payload: bytes, begin: int) -> int:
+    """Return where a value ends that begins there: the end of all, where it is cut off."""
+    if payload[begin : begin + 1] not in (b"{", b"["):
+        found = _SCALAR.match(payload, begin)
+        return found.end() if found else begin
+    depth = 0
+    for match in _STRING_OR_BRACKET.finditer(payload, begin):
+        if match.group() in (b"{", b"["):
+            depth += 1
+        elif match.group() in (b"}", b"]"):
+            depth -= 1
+            if not depth:
+                return match.end()
+    return len(payload)
 
 
 def _may_name_one(payload: bytes) -> bool:
@@ -139,10 +210,3 @@ def _may_name_one(payload: bytes) -> bool:
         or b"pwd" in low
         or b"\\u" in low  # letters of a name may be written so
     )
-
-
-def _blank(match: re.Match[bytes]) -> bytes:
-    name, between = match.group(1), match.group(2)
-    if not names_a_secret(name.decode("utf-8", "replace")):
-        return match.group(0)
-    return b'"' + name + b'"' + between + b'"' + REDACTED.encode() + b'"'

@@ -5,9 +5,9 @@ those kinds of messages that have one: log lines of a gateway, events of a run, 
 MAVLink component (one byte, so a loss of 256 in a row does not show). Pure state: no clock, no I/O.
 """
 
-import re
 from collections import OrderedDict
 
+import msgspec
 from msgspec import Struct
 
 from appliance.plane.keys import Keys
@@ -15,15 +15,20 @@ from appliance.record.expressions import compile_expression
 
 MOST_SOURCES = 20_000
 """Speakers whose numbers are remembered; the one that was silent for longest is forgotten first."""
-_NUMBER = re.compile(rb'"number"\s*:\s*(\d{1,18})')
-_SEQUENCE = re.compile(rb'"sequence"\s*:\s*(\d{1,18})')
-_ATTEMPT = re.compile(rb'"attempt"\s*:\s*(\d{1,9})')
-_COORDINATOR = re.compile(rb'"coordinator"\s*:\s*"([^"]{0,80})"')
 _V1, _V2 = 0xFE, 0xFD
 _WINDOW = 256
 _RESTARTED = 3
 """So many frames in a row that follow each other, and not the last one, are of a component that began again."""
 _UNHEARD = (-1, -1, 0)
+
+
+class _Numbered(Struct):
+    """A message's own numbers: what it tells about may have such fields as well."""
+
+    number: int = -1
+    sequence: int = -1
+    attempt: int = 0
+    coordinator: str = ""
 
 
 class Hole(Struct, frozen=True):
@@ -44,8 +49,9 @@ class Sequences:
             (compile_expression(keys.transition()), "transition"),
             (compile_expression(keys.run()), "run"),
             (compile_expression(keys.log()), "log"),
-            (compile_expression(keys.mavlink()), "mavlink"),
-            (compile_expression(keys.link_frames()), "mavlink"),
+            # Not of what is sent: each other end is told a part of it.
+            (compile_expression(keys.mavlink(direction="rx")), "mavlink"),
+            (compile_expression(keys.link_frames(direction="rx")), "mavlink"),
         )
         self.missing: dict[str, int] = {}
         """Messages not heard so far, by kind."""
@@ -58,15 +64,15 @@ class Sequences:
         """Note a message; returns the hole before it, if there is one."""
         if kind == "mavlink":
             return self._frame(key, payload)
-        found = (_SEQUENCE if kind == "transition" else _NUMBER).search(payload)
-        if found is None:
+        try:
+            told = msgspec.json.decode(payload, type=_Numbered)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return None
-        source = ""
-        if kind == "run" and (attempt := _ATTEMPT.search(payload)):
-            source = attempt.group(1).decode()
-        elif kind == "transition" and (coordinator := _COORDINATOR.search(payload)):
-            source = coordinator.group(1).decode("utf-8", "replace")
-        number = int(found.group(1))
+        number, source = (told.sequence, told.coordinator[:80]) if kind == "transition" else (told.number, "")
+        if kind == "run":
+            source = str(told.attempt)
+        if number < 0:
+            return None
         last = self._note((key, source), number)
         # A new coordinator goes on from a record, a new process counts anew: neither is a hole.
         if last is None or number <= last + 1:

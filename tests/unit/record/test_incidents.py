@@ -1,5 +1,6 @@
 """Incidents: which messages are one, and what is kept around them."""
 
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from appliance.model import Plan, RobotInfo, SoftStop, Subtask, TaskRecord, TaskState, encode
 from appliance.plane.keys import Keys
 from appliance.record.facts import Incident, LoggedMessage, Trigger
-from appliance.record.incidents import EVERY, Ring, Triggers
+from appliance.record.incidents import EACH, EVERY, Ring, Triggers
 from appliance.record.pipeline import Pipeline
 from appliance.record.reader import info, read
 from appliance.record.settings import RecordConfig
@@ -52,6 +53,31 @@ def test_a_failsafe_is_an_incident_when_it_begins() -> None:
     assert [each.reason if each else "" for each in told] == ["", "failsafe", "", "", "failsafe"]
 
 
+@pytest.mark.parametrize(
+    "calm",
+    [
+        b'{"id": "r1", "failsafe": ""}',
+        b'{"id": "r1", "failsafe" : null }',
+        b'{"id": "r1", "failsafe": false, "note": "the \\"failsafe\\": fence has ended"}',
+        b'{"id":"r1","note":"x","limits":{"failsafe":"of something else"}}',
+        b'{"id": "r1", "failsafe": [], "failsafes": 0}',
+    ],
+)
+def test_a_robot_that_is_well_is_no_incident(calm: bytes) -> None:
+    """However it writes that it has no failsafe, with spaces too; so that the next one is not taken for an old one."""
+    triggers = Triggers(KEYS, "rec")
+    assert _incident(triggers, KEYS.robot("r1"), calm) is None
+    found = _incident(triggers, KEYS.robot("r1"), b'{"id": "r1", "failsafe": "battery low"}')
+    assert found is not None
+    assert found.reason == "failsafe"
+
+
+@pytest.mark.parametrize("payload", [b'{"failsafe":', b'["failsafe"]', b'{"failsafe":' + b"[" * 20_000, b'"failsafe"'])
+def test_states_that_are_none_are_no_incident(payload: bytes) -> None:
+    """A stranger's put on a robot's key stops nobody."""
+    assert _incident(Triggers(KEYS, "rec"), KEYS.robot("r1"), payload) is None
+
+
 def test_a_soft_stop_is_an_incident_once() -> None:
     """The gateway that keeps it tells it again; a second stop is another."""
     triggers = Triggers(KEYS, "rec")
@@ -74,7 +100,7 @@ def test_somebody_asks(recorder: str, heard: bool) -> None:
 @given(st.lists(st.tuples(st.floats(0, 3), st.integers(0, 50)), max_size=60))
 def test_the_ring_holds_the_last_seconds_within_its_bytes(steps: list[tuple[float, int]]) -> None:
     """What it gives back is the newest part of what came, in order, neither too old nor too large."""
-    ring, now, came = Ring(seconds=5.0, payload_bytes=200), 0.0, []
+    ring, now, came = Ring(seconds=5.0, most_bytes=1200), 0.0, []
     for wait, size in steps:
         now += wait
         message = LoggedMessage("k", len(came) + 1, b"x" * size)
@@ -82,9 +108,24 @@ def test_the_ring_holds_the_last_seconds_within_its_bytes(steps: list[tuple[floa
         ring.hold(message, now)
     held, back_s = ring.release(now)
     assert held == [each for _, each in came][len(came) - len(held) :]
-    assert sum(len(each.payload) + 1 for each in held) <= 200
+    assert sum(len(each.payload) + 1 + EACH for each in held) <= 1200
     assert back_s <= 5.0 + 1e-9
     assert len(ring) == 0
+
+
+def test_the_ring_takes_no_more_than_it_may() -> None:
+    """Small messages count with all that keeping them takes, not by the few bytes of their payload."""
+    most = 2 * 2**20
+    ring = Ring(seconds=1e9, most_bytes=most)
+    tracemalloc.start()
+    try:
+        for number in range(100_000):
+            key = f"swiftbot/f1/robot/r{number % 40}/state"
+            ring.hold(LoggedMessage(key, 10**18 + number, b"%020d" % number, JSON), float(number))
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most / 3 < taken <= most
 
 
 @pytest.fixture
@@ -154,6 +195,9 @@ def test_plans_are_attached(tmp_path: Path) -> None:
     plan = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="goto"),))
     planned = {"task": "t-1", "sequence": 2, "kind": "planned", "plan": plan, "at_ns": 1, "coordinator": "g1"}
     pipeline.write(_of(KEYS.transition("t-1"), encode(planned)))
-    pipeline.write(_of(KEYS.transition("t-1"), encode(planned | {"sequence": 3, "kind": "dispatched", "plan": None})))
+    for number, (kind, its) in enumerate(
+        (("dispatched", None), ("proposed", plan), ("approved", plan), ("approved", None), ("replanned", plan)), start=3
+    ):
+        pipeline.write(_of(KEYS.transition("t-1"), encode(planned | {"sequence": number, "kind": kind, "plan": its})))
     writer.close()
-    assert info(writer.files[0]).attachments == ("plan-t-1-2.json",)
+    assert info(writer.files[0]).attachments == tuple(f"plan-t-1-{number}.json" for number in (2, 4, 5, 7))

@@ -56,3 +56,16 @@ def test_a_burst_waits_for_room_and_a_stuck_writer_costs_messages() -> None:
     out, drops = intake.take(0)
     assert len(out) == 5
     assert drops["queue full"].count == 75
+
+
+def test_a_burst_of_pictures_waits_for_room_too() -> None:
+    """What would not fit by its bytes waits for the writer as well as what would not by its number."""
+    intake = Intake(messages=100, payload_bytes=100)
+    intake.put_all([_message(30)] * 3)
+    taker = threading.Timer(0.05, lambda: intake.take(0))
+    taker.start()
+    intake.put_all([_message(20)] * 4)
+    taker.join()
+    out, drops = intake.take(0)
+    assert [len(each.payload) for each in out] == [20] * 4
+    assert drops == {}

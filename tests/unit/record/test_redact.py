@@ -1,6 +1,7 @@
 """Secrets never reach a log: planted ones are looked for in what is written."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,54 @@ def test_what_is_no_json_is_treated_as_if() -> None:
     """A payload that was cut off, or never was JSON, loses its secrets all the same."""
     assert PLANTED.encode() not in Redactor().json(b'{"n": 1, "password": "%s", "x": [' % PLANTED.encode())
     assert PLANTED.encode() not in Redactor([PLANTED]).json(b"\xff" + PLANTED.encode())
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"password": "%s", "password": null}',
+        b'{"a": {"token": "%s"}, "a": 1}',
+        b'{"battery": NaN, "api_key": {"value": "%s"}}',
+        b'{"battery": NaN, "secrets": ["x", "%s"]}',
+        b'{"battery": NaN, "pass\\u0077ord": "%s"}',
+        b'{"secrets": ["x", {"y": "%s"',
+        b'{"arguments": "{\\"password\\": \\"%s\\", \\"n\\": 1}"}',
+        b'{"said": ["{\\"inner\\": \\"{\\\\\\"api_key\\\\\\": \\\\\\"%s\\\\\\"}\\"}"]}',
+    ],
+    ids=[
+        "name twice",
+        "object twice",
+        "object in NaN",
+        "list in NaN",
+        "escaped in NaN",
+        "cut off",
+        "in text",
+        "in text in text",
+    ],
+)
+def test_fields_that_hide(payload: bytes) -> None:
+    """Said twice in one object, nested where it is no JSON, or as JSON in a text of JSON: emptied all the same."""
+    redactor = Redactor()
+    assert PLANTED.encode() not in redactor.json(payload % PLANTED.encode())
+    assert redactor.count == 1
+
+
+@pytest.mark.parametrize("secret", ["pässwörter-und-mehr", "abc/def+ghi/jkl==", "line\nbreak\ttab", "<a&b>'c\u2028d"])
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda text: json.dumps({"said": f"it is {text}!"}).encode(),
+        lambda text: json.dumps({"said": f"it is {text}!"}, ensure_ascii=False).encode(),
+        lambda text: json.dumps({"said": f"it is {text}!"}).replace("/", "\\/").encode(),
+        lambda text: ('{"said":"' + "".join(f"\\u{ord(each):04X}" for each in text) + '"}').encode(),
+    ],
+    ids=["ASCII", "UTF-8", "slashes", "all escaped"],
+)
+def test_known_secrets_however_they_are_written(secret: str, written: Callable[[str], bytes]) -> None:
+    """JSON has many ways to write one text; a known secret is seen in each."""
+    cleaned = Redactor([secret]).json(written(secret))
+    assert secret not in json.loads(cleaned)["said"]
+    assert REDACTED in json.loads(cleaned)["said"]
 
 
 json_values = st.recursive(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.model import LogLine, encode
+from appliance.model import LogLine, RunEvent, RunEventKind, encode
 from appliance.plane.keys import Keys
 from appliance.record.facts import LoggedMessage
 from appliance.record.pipeline import Pipeline
@@ -48,6 +48,43 @@ def test_speakers_are_told_apart() -> None:
         payload = b'{"sequence":%d,"coordinator":"%s"}' % (number, coordinator)
         assert sequences.heard("transition", KEYS.transition("t"), payload) is None
     assert sequences.missing == {}
+
+
+def test_only_a_speakers_own_number_counts() -> None:
+    """Numbers in what a line or a run tells about are not its own, in front of it or in its place."""
+    sequences = Sequences(KEYS)
+    for number in range(1, 6):
+        line = LogLine(
+            at_ns=1, level="info", source="g", event="x", fields={"number": 100 * number, "sequence": 1}, number=number
+        )
+        assert sequences.heard("log", KEYS.log("g1"), encode(line)) is None
+        result = {"number": 7 * number, "attempt": number}
+        event = RunEvent(task="t", subtask="s", attempt=1, kind=RunEventKind.PARTIAL, result=result, number=number)
+        assert sequences.heard("run", KEYS.run("t", "s"), encode(event)) is None
+    unnumbered = LogLine(at_ns=1, level="info", source="g", event="x", fields={"number": 50})
+    assert sequences.heard("log", KEYS.log("g1"), encode(unnumbered)) is None
+    for payload in (
+        b"",
+        b"{",
+        b"[1]",
+        b'{"number":"x"}',
+        b'{"number":1e30}',
+        b'{"number":-3}',
+        b'{"number":' + b"9" * 30,
+    ):
+        assert sequences.heard("log", KEYS.log("g1"), payload) is None
+    hole = sequences.heard("log", KEYS.log("g1"), b'{ "fields": {"number": 6}, "number" : 9 }')
+    assert hole is not None
+    assert hole.missing == 3
+
+
+def test_frames_that_are_sent_have_no_holes() -> None:
+    """Of what a link sends each other end is told a part: what went to another one is not missing."""
+    sequences = Sequences(KEYS)
+    for key in (KEYS.mavlink("r1", "tx"), KEYS.link_frames("g1", "0", "tx")):
+        assert sequences.kind_of(key) == ""
+    for key in (KEYS.mavlink("r1", "rx"), KEYS.link_frames("g1", "0", "rx")):
+        assert sequences.kind_of(key) == "mavlink"
 
 
 @pytest.mark.parametrize("header", [b"\xfd\x09\x00\x00", b"\xfe\x09"], ids=["MAVLink 2", "MAVLink 1"])
