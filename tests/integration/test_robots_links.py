@@ -139,6 +139,37 @@ async def test_an_answer_is_not_answered_and_the_latency_is_still_told(links: Li
             await asyncio.sleep(0.05)
 
 
+@pytest.mark.parametrize("autopilot", [0, 8], ids=["generic", "none"])
+async def test_a_router_that_calls_itself_a_station_is_heard(links: Links, autopilot: int) -> None:
+    """What it asks of a vehicle reaches that, what the vehicle says reaches it, and it is no vehicle itself.
+
+    By its documentation mavp2p beats so: MAVLink 1, a ground station, a generic autopilot, system 125, component 191.
+    """
+
+    def ask() -> tuple[int, int]:
+        vehicle, router = links.end("vehicle", 7), links.end("station", 125)
+        router.mav.srcComponent = 191
+        try:
+            for _ in range(100):
+                vehicle.mav.heartbeat_send(*_AUTOPILOT)
+                router.mav.heartbeat_send(6, autopilot, 0, 0, 4, force_mavlink1=True)
+                router.mav.request_data_stream_send(7, 1, 0, 4, 1)
+                found = vehicle.recv_match(type="REQUEST_DATA_STREAM", blocking=True, timeout=0.3)
+                beat = router.recv_match(
+                    type="HEARTBEAT", condition="HEARTBEAT.autopilot==3", blocking=True, timeout=0.3
+                )
+                if found is not None and beat is not None:
+                    return found.get_srcSystem(), beat.get_srcSystem()
+            raise AssertionError("it was not heard")
+        finally:
+            vehicle.close()
+            router.close()
+
+    assert await asyncio.to_thread(ask) == (125, 7)
+    robots = {each.key.split("/")[3] for each in links.told if "/robot/" in each.key and each.key.endswith("/state")}
+    assert len(robots) == 1
+
+
 async def test_a_signing_key_is_passed_on_and_told_to_nobody(links: Links) -> None:
     """SETUP_SIGNING reaches the vehicle that it is for; what is put on the plane, and so recorded, has no key in it."""
 

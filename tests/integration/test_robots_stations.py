@@ -1,8 +1,8 @@
 """Ground stations that nobody here wrote, through a real gateway hub to a simulated vehicle.
 
-MAVSDK by its own server and Python client, MAVProxy by its command line, alone and as a router in between. mavp2p is
-used where it is installed: it comes as source in a Go module, not with the locked Python packages, so its test says
-why it is skipped elsewhere.
+MAVSDK by its own server and Python client, MAVProxy by its command line, alone and as a router in between. mavp2p
+and mavrouter are used where they are installed, found as the benchmark finds them: they come as source in a Go module
+and a crate, not with the locked Python packages, so their tests say why they are skipped elsewhere.
 """
 
 import asyncio
@@ -11,7 +11,6 @@ import importlib.util
 import itertools
 import json
 import math
-import shutil
 import sys
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -24,6 +23,8 @@ from mavsdk_grpc.mavlink_direct import MavlinkMessage
 from mavsdk_grpc.mission_raw import MissionItem
 from pymavlink import mavutil
 
+from appliance.bench.mavlink import others
+from appliance.errors import PrerequisiteError
 from appliance.model import (
     Place,
     RobotInfo,
@@ -388,7 +389,7 @@ async def test_mavproxy_as_a_router_in_between(field: Field, free_ports: Ports) 
 
 
 def _mavp2p(_: Path, stations: int, port: int) -> list[str]:
-    return ["mavp2p", f"tcpc:127.0.0.1:{stations}", f"udps:127.0.0.1:{port}"]
+    return [f"tcpc:127.0.0.1:{stations}", f"udps:127.0.0.1:{port}"]
 
 
 def _mavrouter(folder: Path, stations: int, port: int) -> list[str]:
@@ -401,32 +402,21 @@ def _mavrouter(folder: Path, stations: int, port: int) -> list[str]:
             for kind, number, mode in ends
         )
     )
-    return ["mavrouter", "--config", str(config)]
+    return ["--config", str(config)]
 
 
-def _where_installed(program: str, how: str) -> pytest.MarkDecorator:
-    reason = f"{program} is not installed: `{how}` and put it on the PATH"
-    return pytest.mark.skipif(shutil.which(program) is None, reason=reason)
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        pytest.param(
-            _mavp2p, marks=_where_installed("mavp2p", "go install github.com/bluenviron/mavp2p@latest"), id="mavp2p"
-        ),
-        pytest.param(
-            _mavrouter, marks=_where_installed("mavrouter", "cargo install mavrouter --locked"), id="mavrouter"
-        ),
-    ],
-)
+@pytest.mark.parametrize(("name", "arguments"), [("mavp2p", _mavp2p), ("mavrouter", _mavrouter)])
 async def test_another_router_in_between(
-    field: Field, free_ports: Ports, tmp_path: Path, command: Callable[[Path, int, int], list[str]]
+    field: Field, free_ports: Ports, tmp_path: Path, name: str, arguments: Callable[[Path, int, int], list[str]]
 ) -> None:
     """A station behind a router of others arms the vehicle behind the gateway."""
+    try:
+        ((router,), _) = others.find(name)
+    except PrerequisiteError as missing:
+        pytest.skip(f"{name} is not installed (PATH, build/bin, beside Python); to have it: {missing.remedy}")
     await field.vehicle()
     (port,) = free_ports(1, udp=True)
     quiet = {"stdout": asyncio.subprocess.DEVNULL, "stderr": asyncio.subprocess.DEVNULL}
-    await field.start(*command(tmp_path, field.stations, port), **quiet)
+    await field.start(router.path, *arguments(tmp_path, field.stations, port), **quiet)
     assert await asyncio.to_thread(_arm_through, f"udpout:127.0.0.1:{port}") == 0
     await until(lambda: field.infos[-1].armed)

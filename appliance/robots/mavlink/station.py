@@ -20,7 +20,6 @@ from appliance.robots.api import LinkList
 from appliance.robots.commands import CommandDesk
 from appliance.robots.doors import Tasks
 from appliance.robots.ledger import KeyValues, Ledger
-from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.control import OVERRIDES, moved
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.greeting import ask_streams, heartbeat
@@ -201,13 +200,12 @@ class Station:
         if not self._config.route or frame.system == self._config.system_id:
             return False
         if frame.name == "HEARTBEAT":
-            if frame.message.autopilot == dialect.AUTOPILOT_NONE:
+            if not is_autopilot(frame):  # or a ground station with an autopilot of no kind, as some routers beat
                 if (entry.number, frame.system) not in self._guests:
                     self._guests.add((entry.number, frame.system))
                     log.info("MAVLink guest", link=str(entry.setting.remote), system=frame.system)
                 return True
-            if is_autopilot(frame):  # a vehicle whose camera or radio was heard first
-                self._guests.discard((entry.number, frame.system))
+            self._guests.discard((entry.number, frame.system))  # a vehicle whose camera or radio was heard first
         return (entry.number, frame.system) in self._guests
 
     def _watch_sticks(self, frame: Frame, now: float) -> None:
