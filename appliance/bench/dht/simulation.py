@@ -71,12 +71,14 @@ def run(
 
 def _jobs(size: int, largest: int, lookups: int, seconds: float, seed: int) -> list["_Job"]:
     """All that is counted of a ring."""
-    # A mean over so many members needs less time to be as exact.
+    # A mean over so many members needs less time to be as exact, but not less to settle.
     for_s = seconds if size <= _MANY else seconds / 2
     jobs = [
         _Job("hops", size, partial(hops, size, lookups=lookups, seed=seed)),
         _Job("join", size, partial(joins, size, seed=seed)),
-        _Job("traffic", size, partial(bytes_sent, size, seconds=for_s, lookups=lookups // 4, seed=seed)),
+        _Job(
+            "traffic", size, partial(bytes_sent, size, seconds=for_s, settle_s=seconds, lookups=lookups // 4, seed=seed)
+        ),
     ]
     if size in (_FAILING, largest):
         jobs += [
@@ -219,8 +221,12 @@ def _after(fleet: Fleet, before: Ring, lookups: int) -> dict[str, Any]:
     }
 
 
-def bytes_sent(size: int, *, seconds: float, lookups: int, seed: int, churn: float = 0.01) -> dict[str, Any]:
+def bytes_sent(
+    size: int, *, seconds: float, lookups: int, seed: int, settle_s: float = 0.0, churn: float = 0.01
+) -> dict[str, Any]:
     """Bytes a member sends each second: at rest, and while `churn` of all members die, and as many join, each second.
+
+    Counted over so many seconds each time, after `settle_s` or, where that is 0, as long: intervals adapt slowly.
 
     Who dies says nothing: others notice when they ask. With the full view, every change reaches every member as a
     liveliness token (given beside it; it keeps nothing up at rest, since Zenoh watches the links).
@@ -228,13 +234,14 @@ def bytes_sent(size: int, *, seconds: float, lookups: int, seed: int, churn: flo
     fleet = Fleet(bound=view_bound(size), seed=seed, replicas=REPLICAS).settled(names_of(size))
     for upkeep in fleet.members.values():
         upkeep.settle(fleet.now)
-    fleet.run(fleet.now + seconds)
+    settle_s = settle_s or seconds
+    fleet.run(fleet.now + settle_s)
     fleet.bytes.clear()
     fleet.messages.clear()
     fleet.run(fleet.now + seconds)
     rest = sum(fleet.bytes.values()) / seconds / size
     state = _Churn(fleet, churn * size, seed)
-    state.run(seconds)
+    state.run(settle_s)
     fleet.bytes.clear()
     fleet.messages.clear()
     state.failed = 0

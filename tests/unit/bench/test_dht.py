@@ -98,3 +98,14 @@ def test_a_python_with_kademlia_can_be_named(monkeypatch: pytest.MonkeyPatch) ->
     """SWIFTBOT_KADEMLIA_PYTHON says which Python runs the other side."""
     monkeypatch.setenv("SWIFTBOT_KADEMLIA_PYTHON", "/opt/python")
     assert str(live.find_python()) == "/opt/python"
+
+
+def test_traffic_that_is_counted_for_less_time_has_settled_as_long() -> None:
+    """Intervals adapt slowly: what is counted right after the start is no rest, however long the count."""
+
+    def rest(seconds: float, settle_s: float) -> float:
+        return float(simulation.bytes_sent(64, seconds=seconds, settle_s=settle_s, lookups=1, seed=1)["rest"])
+
+    whole = rest(20.0, 20.0)
+    assert rest(10.0, 20.0) < 1.3 * whole
+    assert rest(10.0, 0.0) > 1.6 * whole
