@@ -145,7 +145,7 @@ class TaskManager:
         """Answer RPC and take up the unfinished tasks whose keys this gateway owns."""
         rpc = self.plane.rpc
         self.plane.dht.resolver = resolve.resolver
-        rpc.register("submit", TaskRequest, self.submit)
+        rpc.register("submit", TaskRequest, self._audit.submission(self.submit))
         rpc.register("accept", TaskRequest, self.accept)
         rpc.register("plan", PlanAsk, self.plan_only)
         rpc.register("experience", ExperienceAsk, self.experience)

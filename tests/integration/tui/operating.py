@@ -26,8 +26,9 @@ AUDITED = {
     "give-back": "control_give", "stop": "soft_stop", "stop-robot": "soft_stop", "resume-robots": "soft_resume",
     "resume-all": "soft_resume", "drain": "drain", "undrain": "undrain", "swap-model": "llm_swap", "warm": "pool_warm",
     "evict": "pool_evict", "release": "pool_release_quarantine", "fetch": "image_fetch",
+    "submit": "submit",
 }  # fmt: skip
-"""As what the audit has each action of the registry that is an order. Who submitted a task stands in its record."""
+"""As what the audit has each action of the registry that is an order."""
 
 T = TypeVar("T", bound=Callable[..., object])
 

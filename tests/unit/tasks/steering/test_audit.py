@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from appliance.errors import ConflictError
-from appliance.model import Act, TaskRecord, encode
+from appliance.errors import ConflictError, PayloadError
+from appliance.model import Act, TaskRecord, TaskRequest, encode
 from appliance.pool.transfer.api import FetchAsk
 from appliance.robots.authority.api import StopAsk
 from appliance.tasks.steering.api import ActsAsk, PauseAsk, RetryAsk
@@ -61,6 +61,28 @@ async def test_orders_given_to_other_gateways_are_remembered(plane: Any) -> None
     for number in range(KEPT + 10):
         plane.session.put(plane.keys.act("gw-2"), encode(Act(id=f"n{number}", verb="x", by="ann", gateway="gw-2")))
     assert len((await audit.acts(ActsAsk(limit=10_000))).acts) == KEPT
+
+
+async def test_submissions_are_audited_apart(plane: Any) -> None:
+    """Who submitted what, taken or refused; however many they are, the orders before them are still told."""
+
+    async def taken(request: TaskRequest) -> TaskRecord:
+        if not request.instruction:
+            raise PayloadError("the instruction is empty")
+        return TaskRecord(id=request.id, instruction=request.instruction)
+
+    audit = Audit(plane.session, plane.keys, "gw-1")
+    await audit.signed("pause", done)(PauseAsk(id="t-1", by="ann"))
+    submit = audit.submission(taken)
+    await submit(TaskRequest(instruction="go", id="t-2", submitter="bob"))
+    with pytest.raises(PayloadError):
+        await submit(TaskRequest(instruction=""))
+    told = [(each.verb, each.by, each.target, each.outcome) for each in plane.session.sent(plane.keys.act("gw-1"), Act)]
+    assert told[1:] == [("submit", "bob", "t-2", "done"), ("submit", "unsigned", "a new task", "payload")]
+    for number in range(KEPT + 10):
+        await submit(TaskRequest(instruction="go", id=f"t-{number}"))
+    acts = (await audit.acts(ActsAsk(limit=10_000))).acts
+    assert (len(acts), acts[0].target, acts[-1].verb) == (KEPT + 1, f"t-{KEPT + 9}", "pause")
 
 
 def test_an_order_names_what_it_is_about() -> None:
