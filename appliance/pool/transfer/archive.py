@@ -212,11 +212,12 @@ def pack(root: Path, target: Path, *, name: str, chunk_bytes: int, most_files: i
 def _ordered(entries: list[Entry]) -> Iterator[Entry]:
     """Files by age, each folder before the first that lies in it; then empty folders, then links.
 
-    So what is new stands behind what is old, and the old keeps its place in the archive and its chunks.
+    So what is new stands behind what is old, and the old keeps its place in the archive and its chunks. An archive
+    knows whole seconds alone: of files of one second the largest stand first, since they lose most by moving.
     """
     folders = {each.path: each for each in entries if stat.S_ISDIR(each.mode)}
     files = [each for each in entries if stat.S_ISREG(each.mode)]
-    for file in sorted(files, key=lambda each: (_seconds(each), each.path)):
+    for file in sorted(files, key=lambda each: (_seconds(each), -each.size, each.path)):
         for parent in reversed(PurePosixPath(file.path).parents):
             if (folder := folders.pop(parent.as_posix(), None)) is not None:
                 yield folder

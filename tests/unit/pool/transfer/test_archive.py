@@ -75,6 +75,19 @@ def test_what_did_not_change_keeps_its_chunks(tmp_path: Path) -> None:
     assert [after.chunk(index) for index in range(whole)] == [before.chunk(index) for index in range(whole)]
 
 
+def test_a_small_file_of_the_same_second_moves_no_large_one(tmp_path: Path) -> None:
+    """An archive knows seconds, and a run may write its note in the one in which the weights were written."""
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "weights").write_bytes(b"w" * 4 * CHUNK)
+    os.utime(root / "weights", (7, 7))
+    before = packed(root, tmp_path / "one")
+    (root / "note").write_bytes(b"seen")
+    os.utime(root / "note", (7, 7))
+    after = packed(root, tmp_path / "two")
+    assert [after.chunk(index) for index in range(4)] == [before.chunk(index) for index in range(4)]
+
+
 def test_fingerprint_sees_every_kind_of_change(tmp_path: Path) -> None:
     """Content in place with its old time, mode, name, link and emptiness change the fingerprint; looking does not."""
     root = tmp_path / "root"
