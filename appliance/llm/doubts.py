@@ -18,11 +18,12 @@ _NUMBERED = re.compile(rf"\b{_KIND}[ _]?(\d+|{'|'.join(list(NUMBERS)[1:10])})\b"
 """What is a robot's name whoever is there."""
 _PARTS = re.compile(r"[_.-]")
 _FIGURE = re.compile(r"(?<![\w.:])\d+(?:\.\d+)?(?![\d.:]*\w)")
-_IDLE = re.compile(r"\b(by|before|within|until|till|at most|no later than|in less than) (the )?$")
+_DEADLINE = re.compile(r"\b(by|before|within|until|till|at most|no later than|in less than) (the )?$")
 """Before a figure: a deadline, which plans do not have."""
-_TOGETHER = re.compile(r"\b(while|whilst|meanwhile|meantime|at the same time|simultaneously|in parallel|during)\b")
+_SIDE_BY_SIDE = re.compile(r"\b(while|whilst|meanwhile|meantime|at the same time|simultaneously|in parallel|during)\b")
+"""Fewer words than in `sense`, which may say so: these hardly ever stand where nothing does."""
 _AGAIN = re.compile(r"\b(twice|thrice|again|times|each|every|once more|both)\b")
-_AS_OFTEN = frozenset(
+_OFTEN_TWICE = frozenset(
     ("wait_for", "hold", "takeoff", "land", "return_home", "dock", "goto", "evaluate", "aggregate", "train_local")
 ) | {"notify", "report", "patrol", "say"}
 """Skills that plans often have twice."""
@@ -73,7 +74,7 @@ def _figures(text: str, said: list[str]) -> Iterable[str]:
     numbers = [float(each) for each in has]
     for found in _FIGURE.finditer(text):
         figure = found.group()
-        if figure in has or _IDLE.search(text[: found.start()]):
+        if figure in has or _DEADLINE.search(text[: found.start()]):
             continue
         if not any(
             abs(float(figure) * unit - number) <= 1e-3 * max(1.0, number) for unit in _UNITS for number in numbers
@@ -84,7 +85,7 @@ def _figures(text: str, said: list[str]) -> Iterable[str]:
 def _together(text: str, meaning: Meaning) -> Iterable[str]:
     reach = before(meaning.subtasks)
     pairs = itertools.combinations(meaning.subtasks, 2)
-    if (found := _TOGETHER.search(text)) and all(one.id in reach[two.id] for one, two in pairs):
+    if (found := _SIDE_BY_SIDE.search(text)) and all(one.id in reach[two.id] for one, two in pairs):
         yield f'"{found.group()}" is said and nothing runs side by side'
 
 
@@ -94,6 +95,6 @@ def _twice(text: str, meaning: Meaning) -> Iterable[str]:
     seen: list[tuple[object, ...]] = []
     for subtask in meaning.subtasks:
         what = (subtask.skill, subtask.robot, subtask.params)
-        if subtask.skill not in _AS_OFTEN and what in seen:
+        if subtask.skill not in _OFTEN_TWICE and what in seen:
             yield f"{subtask.id} ({subtask.skill}) is planned twice"
         seen.append(what)

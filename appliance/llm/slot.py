@@ -94,8 +94,10 @@ class Slot:
         try:
             card = read_card(folder)
             evidence = None if card is None else read_evidence(folder)
-        except ValueError as error:
-            raise SlotError("prerequisite", str(error), "copy the model folder again") from error
+        except (ValueError, OSError) as error:
+            raise SlotError(
+                "prerequisite", str(error), "copy the model folder again, readable for the gateway"
+            ) from error
         self.speaker = (
             None
             if card is None

@@ -148,14 +148,16 @@ def test_the_words_have_a_say_in_which_answer_is_given(folder: Path, monkeypatch
     assert speaker.answer(question).symbols == plain.symbols
 
 
-@pytest.mark.parametrize("damage", [b"", b"no evidence"])
-async def test_damaged_evidence_is_named(folder: Path, tmp_path: Path, damage: bytes) -> None:
+@pytest.mark.parametrize("damage", [b"", b"no evidence", None])
+async def test_damaged_evidence_is_named(folder: Path, tmp_path: Path, damage: bytes | None) -> None:
     """A model whose second opinion cannot be read is a prerequisite that is missing, with its path."""
     other = tmp_path / "model"
     other.mkdir()
     for file in folder.iterdir():
         (other / file.name).write_bytes(file.read_bytes())
-    (other / FILE).write_bytes(damage)
+    (other / FILE).write_bytes(damage or b"")
+    if damage is None:
+        (other / FILE).chmod(0)
     tier = LocalTier(LlmConfig(tiers=("local",), local_model=str(other)), CATALOGUE)
     await tier.start()
     try:
