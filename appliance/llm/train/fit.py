@@ -227,7 +227,9 @@ class Trainer:
 
     def _learn(self, inputs: torch.Tensor, labels: torch.Tensor) -> float:
         rate = rate_at(self._step, self.recipe)
-        loss = self._loss(inputs.to(self._device), labels.to(self._device))
+        # What is left out follows from the step, too: a run that goes on is the run that was not stopped.
+        torch.manual_seed(self.recipe.seed * 1_000_003 + self._step)
+        loss = self._loss(inputs.to(self._device), labels.to(self._device), dropout=self.recipe.dropout)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._model.parameters(), 1.0)
         for optimiser in self._optimisers:

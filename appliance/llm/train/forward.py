@@ -46,19 +46,20 @@ class AnswerLoss:
             self._attend = torch.compile(_attend, dynamic=True)
             self._mix = torch.compile(_mix, dynamic=True)
 
-    def __call__(self, inputs: Tensor, labels: Tensor) -> Tensor:
+    def __call__(self, inputs: Tensor, labels: Tensor, *, dropout: float = 0.0) -> Tensor:
         """Return the mean cross-entropy over the answers' tokens.
 
         Args:
             inputs: tokens [rows, length], padded behind.
             labels: the same shape; IGNORED wherever no answer is.
+            dropout: share of the embeddings, and of what each layer adds, that is left out at random.
         """
         body = self._model.model
         length = inputs.shape[1]
         cos, sin = self._cos[:length], self._sin[:length]
         targets = labels[:, 1:].reshape(-1)
         wanted = torch.nn.functional.pad(labels[:, 1:] != IGNORED, (0, 1)).reshape(-1).nonzero().squeeze(1)
-        x = functional.embedding(inputs, body.embed_tokens.weight)
+        x = functional.dropout(functional.embedding(inputs, body.embed_tokens.weight), dropout)
         width = x.shape[-1]
         last = len(body.layers) - 1
         for number, layer in enumerate(body.layers):
@@ -85,6 +86,7 @@ class AnswerLoss:
                 torch.cat((mlp.gate_proj.weight, mlp.up_proj.weight)).to(HALF),
                 mlp.down_proj.weight.to(HALF),
                 self._eps,
+                dropout,
             )
             if number != last:
                 x = x.reshape(*inputs.shape, width)
@@ -117,7 +119,9 @@ def _attend(
     return seen.transpose(1, 2).reshape(rows, length, heads * size)
 
 
-def _mix(x: Tensor, seen: Tensor, out: Tensor, norm: Tensor, gate_up: Tensor, down: Tensor, eps: float) -> Tensor:
-    x = x + functional.linear(seen, out).float()
+def _mix(
+    x: Tensor, seen: Tensor, out: Tensor, norm: Tensor, gate_up: Tensor, down: Tensor, eps: float, dropout: float
+) -> Tensor:
+    x = x + functional.dropout(functional.linear(seen, out).float(), dropout)
     gate, up = functional.linear(_norm(x, norm, eps), gate_up).chunk(2, dim=-1)
-    return x + functional.linear(functional.silu(gate) * up, down).float()
+    return x + functional.dropout(functional.linear(functional.silu(gate) * up, down).float(), dropout)

@@ -45,6 +45,8 @@ class Recipe:
     decay: float = 0.1
     original: float = 0.1
     """Share of examples as they were written, without variation."""
+    dropout: float = 0.0
+    """Share of what a layer adds, and of a token's embedding, that is left out of a step, anew each time."""
 
 
 def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:

@@ -1,8 +1,8 @@
 """Makes an example another one whose plan is exact as well.
 
 Each variation changes words only where the plan's meaning does not depend on them, or changes words and plan alike:
-other names, two instructions as one, other marks and fillers, misspelt words that name nothing, figures as words,
-another roster. What cannot be varied safely (a group's "both drones", say) is left as it is.
+other names, other words for a verb, two instructions as one, other marks and fillers, misspelt words that name nothing,
+figures as words, another roster. What cannot be varied safely (a group's "both drones", say) is left as it is.
 """
 
 import random
@@ -17,6 +17,7 @@ from appliance.llm.language import values
 from appliance.llm.language.codec import ANY
 from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
 from appliance.llm.train.lexicon import Lexicon
+from appliance.llm.train.reword import reworded
 
 MAX_WORDS = 160
 MAX_SUBTASKS = 14
@@ -68,6 +69,8 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
         if others and rng.random() < chance:
             other = rng.choice(others)
             made = joined(made, addressed(other, lexicon, rng) if rng.random() < 0.6 else other, rng) or made
+    if rng.random() < 0.6:
+        made = reworded(made, rng)
     if rng.random() < 0.8:
         made = renamed(made, lexicon, rng)
     for chance, change in _CHANGES:
