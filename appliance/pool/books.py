@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 
 from msgspec.structs import replace
 
@@ -38,11 +38,12 @@ class WithdrawnError(SwiftbotError):
 
 
 class _Waiter:
-    """Somebody in the queue."""
+    """Somebody in the queue; one who `has_own` has a container that is only starting, and is not counted."""
 
-    def __init__(self, need: Need, turn: Turn) -> None:
+    def __init__(self, need: Need, turn: Turn, *, has_own: bool = False) -> None:
         self.need = need
         self.turn = turn
+        self.has_own = has_own
         self.got: asyncio.Future[PooledContainer] = asyncio.get_running_loop().create_future()
 
 
@@ -95,8 +96,8 @@ class Books:
 
     @property
     def queue(self) -> int:
-        """Runs that wait for a container."""
-        return len(self._waiting)
+        """Runs that wait for a container and have none that is starting for them."""
+        return sum(not each.has_own for each in self._waiting.values())
 
     @property
     def memory_mb(self) -> int:
@@ -129,9 +130,10 @@ class Books:
         return True
 
     def send_away(self) -> None:
-        """Let nobody wait any more."""
+        """Let nobody wait any more; starts in progress are let come to their end."""
         for waiter in self._waiting.values():
-            waiter.got.cancel()
+            if not waiter.has_own:
+                waiter.got.cancel()
 
     def clear(self) -> None:
         """Forget all containers, without a word to anybody: they are somebody else's now."""
@@ -248,30 +250,35 @@ class Books:
     # --- the queue --------------------------------------------------------------------------------------------
 
     def waiting(self) -> list[tuple[Turn, Need]]:
-        """Return those who wait in the order in which they will be served."""
-        needs = {each.turn.number: each.need for each in self._waiting.values() if not each.got.done()}
-        order = self._turns.order((self._waiting[number].turn for number in needs), time.monotonic())
-        return [(turn, needs[turn.number]) for turn in order]
+        """Return those who wait and have no container starting, in the order in which they will be served."""
+        return [(turn, self._waiting[turn.number].need) for turn in self._in_turn(self._without())]
+
+    def _without(self) -> list[_Waiter]:
+        """Return who waits and has no container that is starting."""
+        return [each for each in self._waiting.values() if not each.got.done() and not each.has_own]
+
+    def _in_turn(self, waiting: Iterable[_Waiter]) -> list[Turn]:
+        return self._turns.order((each.turn for each in waiting), time.monotonic())
 
     def would_be_last(self, turn: Turn) -> bool:
         """Whether all who wait would be served before one who comes now."""
-        return not self._waiting or self._last(replace(turn, number=sys.maxsize)).number == sys.maxsize
+        return not self.queue or self._last(replace(turn, number=sys.maxsize)).number == sys.maxsize
 
     def _last(self, turn: Turn) -> Turn:
-        waiting = [each.turn for each in self._waiting.values() if not each.got.done()]
+        waiting = [each.turn for each in self._without()]
         return self._turns.order([*waiting, turn], time.monotonic())[-1]
 
     def withdraw(self, run_id: str) -> bool:
         """Take a run out of the queue, unless it has been served: whoever waits for it gets a WithdrawnError."""
         for waiter in self._waiting.values():
-            if waiter.turn.id == run_id and not waiter.got.done():
+            if waiter.turn.id == run_id and not waiter.got.done() and not waiter.has_own:
                 waiter.got.set_exception(WithdrawnError(f"{run_id} was taken out of the queue"))
                 return True
         return False
 
     def _take_a_place(self, need: Need, turn: Turn) -> _Waiter:
         """Join the queue; a full one turns away whoever would be served last, be it the one who comes."""
-        waiting = [each for each in self._waiting.values() if not each.got.done()]
+        waiting = self._without()
         if len(waiting) >= self._config.queue and waiting:
             last = self._last(turn)
             self._refused["queue full"] += 1
@@ -308,25 +315,58 @@ class Books:
         finally:
             del self._waiting[waiter.turn.number]
 
+    async def sooner(
+        self, need: Need, turn: Turn | None, own: PooledContainer, started: Awaitable[SwiftbotError | None]
+    ) -> PooledContainer:
+        """Wait until `own`, which is starting for a run, has `started`, or another comes free before that.
+
+        A start takes a hundred times as long as many a run, so whoever waits for one takes what comes free meanwhile,
+        in turn with all who wait; its own is then for the next. What is not returned has been given back.
+
+        Raises:
+            SwiftbotError: it did not start.
+        """
+        turn = replace(turn or Turn(id="", since=time.monotonic()), number=next(self._numbers))
+        waiter = self._waiting[turn.number] = _Waiter(need, turn, has_own=True)
+        starting = asyncio.ensure_future(started)
+        try:
+            await asyncio.wait((starting, waiter.got), return_when=asyncio.FIRST_COMPLETED)
+            if waiter.got.done():
+                self.give_back(own)
+                return waiter.got.result()
+            if (error := await starting) is not None:
+                raise error
+        except asyncio.CancelledError:
+            for container in (own, waiter.got.result()) if waiter.got.done() else (own,):
+                self.give_back(container)
+            raise
+        else:
+            return own
+        finally:
+            del self._waiting[turn.number]
+            starting.cancel()
+
     def serve(self) -> None:
         """Hand what is ready, or a start that there is room for, to those who wait, in their turns."""
         if not self._waiting:
             return
         # Handing out only takes: what could not be had for one need cannot be had for another like it just after.
         in_vain: set[Need] = set()
-        for turn, need in self.waiting():
+        for turn in self._in_turn(each for each in self._waiting.values() if not each.got.done()):
             waiter = self._waiting[turn.number]
-            if waiter.got.done() or need in in_vain:
+            if waiter.got.done() or waiter.need in in_vain:
                 continue
             container = self.take(waiter.need)
-            if container is None:
+            if container is None and not waiter.has_own:
                 try:
                     container = self._begin(waiter.need)
                 except SwiftbotError as error:
                     waiter.got.set_exception(error)
                     continue
             if container is None:
-                in_vain.add(waiter.need)
+                if not waiter.has_own:
+                    in_vain.add(waiter.need)
             else:
-                self._turns.served(turn)
+                if not waiter.has_own:
+                    self._turns.served(turn)
                 waiter.got.set_result(container)

@@ -181,7 +181,9 @@ class Keeper:
     # --- starting ---------------------------------------------------------------------------------------------
 
     async def acquire(self, need: Need, turn: Turn | None = None) -> PooledContainer:
-        """Start a container, or wait for one when there is no room. Its reservation tells a new one: FOR_A_RUN.
+        """Start a container, or wait for one when there is no room; one that comes free meanwhile is taken instead.
+
+        Its reservation tells a new one: FOR_A_RUN.
 
         Raises:
             PoolError, PrerequisiteError, UnreachableError: none started, or none came free in time.
@@ -195,13 +197,7 @@ class Keeper:
         if container is None:
             container = await self.books.wait(need, turn)
         if container.info.state is ContainerState.STARTING:
-            try:
-                error = await self.starts.wait(container)
-            except asyncio.CancelledError:
-                self.books.give_back(container)
-                raise
-            if error is not None:
-                raise error
+            return await self.books.sooner(need, turn, container, self.starts.wait(container))
         return container
 
     def _begin(self, need: Need) -> PooledContainer | None:

@@ -11,7 +11,10 @@ from appliance.pool.policies.demand import Demand
 from appliance.pool.policies.forecaster import Level, Surety
 
 LEAST_REST_S = 5.0
-"""A container is not given up to be started again sooner than this, nor than ten cold starts."""
+"""A container is not given up to be started again sooner than this, nor than ten cold starts.
+
+Nor is it given up for not having been used for less than that: idle times seen under load may all be milliseconds,
+where the published policy counts them by the minute."""
 MARGIN = 0.1
 """The window is widened by this part of its ends (ATC 2020 uses 10 %)."""
 
@@ -45,7 +48,8 @@ class Histogram:
         idle_s = now - self._demand.images[level.image].idle_since(level.number, since)
         if idle_s < window[0]:
             return "not due for a while"
-        return "it was due and nobody came" if idle_s >= window[1] else ""
+        missed = idle_s >= window[1] and min(idle_s, now - since) >= _least_s(level)
+        return "it was due and nobody came" if missed else ""
 
     def window(self, level: Level) -> tuple[float, float] | None:
         """Return from when to when after its last use a level is kept, seconds; None: not representative."""
@@ -55,4 +59,9 @@ class Histogram:
         if found is None:
             return None
         begin_s = found[0] * (1 - MARGIN) - level.ahead_s
-        return (begin_s if begin_s > max(LEAST_REST_S, 10 * level.ahead_s) else 0.0), found[1] * (1 + MARGIN)
+        return (begin_s if begin_s > _least_s(level) else 0.0), found[1] * (1 + MARGIN)
+
+
+def _least_s(level: Level) -> float:
+    """Return for how long at least a container rests, or is kept."""
+    return max(LEAST_REST_S, 10 * level.ahead_s)

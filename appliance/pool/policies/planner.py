@@ -28,7 +28,7 @@ from appliance.pool.policies.histogram import Histogram
 from appliance.pool.policies.keeping import KeepFixed, KeepHistogram, Keeping, KeepWorth
 from appliance.pool.policies.learned import Learned, LearnedState
 from appliance.pool.policies.least_recent import LeastRecent
-from appliance.pool.policies.rate import Rate
+from appliance.pool.policies.rate import Rate, containers_for
 from appliance.pool.settings import PoolConfig
 
 AHEAD = 1.5
@@ -271,8 +271,9 @@ class Planner:
         for image in images:
             busy = view.busy.get(image, 0)
             ahead_s = self._ahead_s(image)
-            count = firm = sure = self._settings.floor.get(image, 0)
-            why = f"pool.floor keeps {count} ready"
+            floor = self._settings.floor.get(image, 0)
+            count = firm = sure = max(0, floor - self._soon_free(image, busy, now))
+            why = f"pool.floor keeps {floor} ready"
             while count < view.capacity:
                 reason, surety = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
                 if not reason:
@@ -283,6 +284,18 @@ class Planner:
             if count:
                 wanted[image] = _Wanted(count, firm, sure, why)
         return wanted
+
+    def _soon_free(self, image: str, busy: int, now: float) -> int:
+        """Return how many busy containers of an image count as ready: free again before a new one would be.
+
+        None where runs take longer than a start. Else those beyond what the load keeps busy (`rate`): with two runs a
+        second of 3 ms none is, so that the one of this moment is no reason to start another.
+        """
+        demand = self._demand.images.get(image)
+        if not busy or demand is None or demand.service_s * 1e3 >= self._costs.of(image):
+            return 0
+        load = demand.service_s / max(1e-9, demand.gap_s(now))
+        return max(0, busy + 1 - containers_for(load, self._settings.hit_target))
 
     def _wants(self, level: Level, now: float) -> tuple[str, Surety]:
         """Return why a level is wanted, empty when it is not, and how surely."""

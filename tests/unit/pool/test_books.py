@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.errors import RefusedError
+from appliance.errors import PoolError, RefusedError
 from appliance.model import ContainerInfo, ContainerState, Need
-from appliance.pool.books import Books, WithdrawnError
+from appliance.pool.books import FOR_A_RUN, Books, WithdrawnError
 from appliance.pool.container import PooledContainer
 from appliance.pool.settings import PoolConfig
 from appliance.pool.turns import Turn
@@ -119,3 +119,75 @@ async def test_a_run_is_withdrawn_once_and_only_while_it_waits() -> None:
         await waiting["a"]
     assert (await waiting["b"]).id == "c1"
     assert books.queue == 0
+
+
+def starting(name: str) -> PooledContainer:
+    """Return a container that is being started for a run."""
+    found = container(name, "base")
+    found.become(ContainerState.STARTING)
+    found.reservation = FOR_A_RUN
+    return found
+
+
+async def test_what_comes_free_sooner_than_a_start_is_taken() -> None:
+    """Who waits for a start takes what comes free before; what was started is ready for the next when it is there."""
+    books, started = full_books(), asyncio.get_running_loop().create_future()
+    books.add(other := container("c1", "base"))
+    books.busy(other, "run")
+    books.add(own := starting("c2"))
+    waiting = asyncio.create_task(books.sooner(NEED, None, own, started))
+    await asyncio.sleep(0)
+    assert books.queue == 0  # it has a container to come: nobody need offer it elsewhere, or turn away others
+    assert books.waiting() == []
+    books.ready(other)
+    assert await waiting is other
+    assert (other.info.state, own.reservation) == (ContainerState.RESERVED, "")
+
+
+async def test_a_start_that_ends_first_is_taken() -> None:
+    """The container that was started for a run goes to it when it is the first to be there, and to nobody else."""
+    books, started = full_books(), asyncio.get_running_loop().create_future()
+    books.add(own := starting("c1"))
+    waiting = asyncio.create_task(books.sooner(NEED, None, own, started))
+    await asyncio.sleep(0)
+    books.hold(own, FOR_A_RUN)
+    started.set_result(None)
+    assert await waiting is own
+    assert own.reservation == FOR_A_RUN
+    books.add(other := container("c2", "base"))
+    books.serve()
+    assert other.info.state is ContainerState.READY
+
+
+async def test_a_start_that_fails_or_is_given_up_leaves_nothing_held() -> None:
+    """A failed start is told to whoever waits for it; one who goes away gives back what was handed over meanwhile."""
+    books, started = full_books(), asyncio.get_running_loop().create_future()
+    started.set_result(PoolError("it ended at once"))
+    with pytest.raises(PoolError, match="ended at once"):
+        await books.sooner(NEED, None, starting("c1"), started)
+    books.add(own := starting("c2"))
+    books.add(other := container("c3", "base"))
+    waiting = asyncio.create_task(books.sooner(NEED, None, own, asyncio.get_running_loop().create_future()))
+    await asyncio.sleep(0)
+    books.serve()
+    assert other.info.state is ContainerState.RESERVED
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    assert (other.info.state, own.reservation) == (ContainerState.READY, "")
+
+
+async def test_those_without_a_start_are_served_in_turn_with_those_that_have_one() -> None:
+    """Who came first gets what comes free, whether a container is starting for him or not; the other is next."""
+    books, started = full_books(), asyncio.get_running_loop().create_future()
+    books.add(own := starting("c1"))
+    first = asyncio.create_task(books.sooner(NEED, None, own, started))
+    await asyncio.sleep(0)
+    second = asyncio.create_task(books.wait(NEED))
+    await asyncio.sleep(0)
+    assert books.queue == 1
+    books.add(free := container("c2", "base"))
+    books.serve()
+    assert await first is free
+    assert not second.done()
+    books.ready(own)  # its start has ended
+    assert await second is own

@@ -97,6 +97,16 @@ def test_histogram_does_not_send_away_what_is_back_in_seconds() -> None:
     assert Histogram(demand).rests(level(), end, end + 0.5) == ""
 
 
+def test_what_came_within_milliseconds_is_not_given_up_within_them() -> None:
+    """After a load under which each idle time was milliseconds a container is kept for ten cold starts all the same."""
+    demand, end = periodic(0.05, 60, service_s=0.01)
+    histogram = Histogram(demand)
+    assert histogram.rests(level(), end, end + 9.9) == ""
+    assert histogram.rests(level(), end + 9.0, end + 12.0) == ""  # new, or used for another level
+    assert histogram.rests(level(), end, end + 10.1) == "it was due and nobody came"
+    assert histogram.wants(level(), end + 5.0) == ""  # no reason to start another
+
+
 def test_levels_are_learned_apart() -> None:
     """Two at a time each hour: the second is due by its own idle times, though the first is wanted each minute."""
     demand = Demand()

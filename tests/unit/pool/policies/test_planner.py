@@ -3,6 +3,7 @@
 from collections import Counter
 
 import msgspec
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -86,6 +87,63 @@ def test_tend_fills_the_floor_and_lets_the_old_go() -> None:
     starts, retired = planner.tend(view, 110.0)
     assert [each.image for each in starts] == ["base", "base"]
     assert [each.id for each in retired] == ["older", "old"]
+
+
+def busy_view(idle: int, busy: int) -> View:
+    """Return a view of a roomy gateway with so many containers of one image; the idle ones were used at 0 s."""
+    kept = tuple(
+        Idle(id=f"c{number}", image="base", memory_mb=256, runs=1, cold_ms=500.0, since=0.0) for number in range(idle)
+    )
+    both = idle + busy
+    return View(
+        idle=kept, busy={"base": busy}, memory_mb=256 * both, containers=both, budget_mb=4096, capacity=8
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "service_s", "busy", "starts"),
+    [
+        (0.5, 0.003, 1, 0),  # over before a new one could be there
+        (0.5, 2.0, 1, 1),  # longer than a start: the floor is to be ready beside it
+        (0.2, 0.15, 1, 1),  # three quarters of one are busy at any time, so one more is wanted
+        (0.2, 0.15, 4, 0),  # more than that load needs: some of them are free soon
+    ],
+)
+def test_the_floor_counts_what_is_free_soon(gap_s: float, service_s: float, busy: int, starts: int) -> None:
+    """A run that is over before a new container could be ready is no reason to start one, unless many keep coming."""
+    planner = Planner(PoolConfig(floor={"base": 1}, prewarm=()), ColdCosts(500.0), lambda _: 256)
+    at = 0.0
+    for number in range(40):
+        at = number * gap_s
+        planner.arrived("base", at)
+        planner.ended("base", service_s, at + min(service_s, gap_s))
+    assert len(planner.tend(busy_view(0, busy), at + gap_s)[0]) == starts
+    # With nothing busy the floor is what is ready.
+    assert len(planner.tend(busy_view(0, 0), at + gap_s)[0]) == 1
+
+
+def test_after_a_load_nothing_is_started_and_given_up_in_turns() -> None:
+    """When short runs come seldom after having come often, no container is started for the floor and given up again."""
+    planner = Planner(PoolConfig(floor={"base": 1}), ColdCosts(200.0), lambda _: 256)
+    at = 0.0
+    for _ in range(100):  # four at a time, 20 ms apart
+        for step in range(4):
+            planner.arrived("base", at + step * 1e-3)
+        for step in range(4):
+            planner.ended("base", 0.004, at + 0.004 + step * 1e-3)
+        at += 0.02
+    held, started, given_up = 4, 0, 0
+    for number in range(120):  # one a second, looked at while it runs and just after
+        now = at + number
+        planner.arrived("base", now)
+        for view in (busy_view(held - 1, 1), busy_view(held, 0)):
+            idle = tuple(replace(each, since=now - 0.5) for each in view.idle)
+            starts, retired = planner.tend(replace(view, idle=idle), now + 0.002)
+            started, given_up = started + len(starts), given_up + len(retired)
+            held += len(starts) - len(retired)
+        planner.ended("base", 0.003, now + 0.003)
+    assert started == 0
+    assert given_up <= 3
 
 
 IMAGES = ("base", "vision", "speech")
