@@ -7,14 +7,15 @@ Each mode gets a fleet of its own with the same containers, memory and queue; on
                none started ahead beyond the first, which it is given so that it is not made worse than it has to be
     federated  those of other gateways too, and whatever the product's defaults start ahead
 
-Rates are offered in rising order as an open loop (`load`), with a pause in between until nothing runs any more; the
-first one that is too much ends the ladder. All of it shares the machine with the fleet, and the sender is seen too.
+Rates are offered in rising order as an open loop (`load`), with a pause in between until nothing runs and nothing is
+being started any more; the first one that is too much ends the ladder. What the pools start and give up while a rate
+is offered is part of it. All of it shares the machine with the fleet, and the sender is seen too.
 """
 
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import psutil
@@ -27,6 +28,7 @@ from appliance.bench.fleet import Orders, Progress
 from appliance.bench.load import Sampled, Spread, account, arrivals, breaking, verdict, window_s
 from appliance.errors import ConfigError
 from appliance.local_fleet import FleetState
+from appliance.model import GatewayStatus
 from appliance.pool.settings import PoolConfig
 
 Mode = Literal["cold", "local", "federated"]
@@ -133,17 +135,22 @@ async def _ladder(
     for name in state.gateways:  # each pays for its first run now
         await orders.run(name)
     for rate in sorted(options.rates):
-        await _settle(orders)
+        settled_s = await _settle(orders, progress)
         window = window_s(rate, seconds=options.seconds, least=options.least, most_s=options.most_s)
         wanted = arrivals(rate, window, state.gateways, spread=spread, seed=options.seed)
         watch = Watch(state, orders)
+        kept = await upkeep(orders)
         sampling = asyncio.create_task(watch.sample(), name="watch the machine")
         try:
             outcomes = await orders.offer(wanted, service_ms=service_ms, patience_s=PATIENCE_S, sent=watch.end)
         finally:
             sampling.cancel()
         seen = watch.seen
-        cells[rate] = account(outcomes, seen) | {"seconds": round(window, 1)}
+        cells[rate] = account(outcomes, seen) | {
+            "seconds": round(window, 1),
+            "settled_s": round(settled_s, 1),
+            "upkeep": dict(await upkeep(orders) - kept),
+        }
         whys[rate] = verdict(outcomes, seen, limit_ms=options.limit_ms)
         start = cells[rate]["start"]
         progress(
@@ -161,15 +168,39 @@ async def _ladder(
     }
 
 
-async def _settle(orders: Orders) -> None:
-    """Wait until no gateway tells of runs in progress or waiting; a load that was too much takes a while."""
-    until = time.monotonic() + SETTLE_S
+async def _settle(orders: Orders, progress: Progress) -> float:
+    """Wait until no gateway tells of runs in progress or waiting, nor of containers that are yet to be ready.
+
+    A load that was too much takes a while; returns for how long, seconds, at most `SETTLE_S`.
+    """
+    began = time.monotonic()
     await asyncio.sleep(0.3)
-    while time.monotonic() < until:
-        gateways = orders.client.plane.registry.gateways.values()
-        if all(each.running == 0 and each.queue == 0 for each in gateways):
-            return
+    while not quiet(gateways := orders.client.plane.registry.gateways):
+        waited_s = time.monotonic() - began
+        if waited_s > SETTLE_S:
+            progress(f"  not quiet after {waited_s:.0f} s: " + ", ".join(_at_work(gateways)))
+            break
         await asyncio.sleep(0.1)
+    return time.monotonic() - began
+
+
+def quiet(gateways: Mapping[str, GatewayStatus]) -> bool:
+    """Whether nothing runs, waits or is being started on any of the gateways."""
+    return not _at_work(gateways)
+
+
+def _at_work(gateways: Mapping[str, GatewayStatus]) -> list[str]:
+    return [
+        f"{name} has {each.running} runs, {each.queue} waiting, {each.containers - each.ready} containers not ready"
+        for name, each in sorted(gateways.items())
+        if each.running or each.queue or each.containers > each.ready
+    ]
+
+
+async def upkeep(orders: Orders) -> Counter[str]:
+    """Return how many containers all pools together have started, given up and so on since they began, by kind."""
+    found, _ = await orders.client.pool_decisions(0)
+    return sum((Counter(each.counts) for each in found.values()), Counter[str]())
 
 
 class Watch:

@@ -67,8 +67,8 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     memory_mb: Annotated[int, Meta(ge=64)] = 4096
     """Memory of all containers together, by what they are allowed, not by what they use."""
     floor: dict[str, Annotated[int, Meta(ge=0, le=64)]] = field(default_factory=lambda: {"base": 2, "vision": 1})
-    """Containers of each image kept ready: two so that a second subtask finds one while the first is replaced. One whose
-    run is over before a new one could be there counts as ready."""
+    """Containers of each image kept ready: two so that a second subtask finds one while the first is replaced.
+    One whose run is over before a new one could be there counts as ready."""
     cpu: Positive = 1.0
     """Cores of a container whose skills ask for less."""
     container_memory_mb: Annotated[int, Meta(ge=32)] = 256

@@ -3,8 +3,9 @@
 Event-driven, without a clock of its own, seeded by the trace: the same trace and settings give the same figures.
 What is simulated is what the pool does: a run takes the ready container of its image here that selection would take;
 in federated mode else one of another gateway, when its cost is below gamma times a cold start; else a container is
-started for it, for which the planner makes room; else it waits, first come first served. Starting takes the image's
-cold start, ending nothing.
+started for it, for which the planner makes room; else it waits, first come first served. A run whose container is
+starting takes what comes free before, unless a start is to belong to its run (`binds`). Starting takes the image's cold
+start, ending nothing.
 """
 
 import hashlib
@@ -33,10 +34,13 @@ class Outcome(Struct, frozen=True, kw_only=True):
     local: int
     remote: int
     cold: int
+    """Runs in a container that was started for a run and had none before."""
     cold_s: float
     """What the cold starts took together."""
     waited: int
     """Runs that had to wait for room; they count as warm or cold as well."""
+    sooner: int
+    """Runs that took what came free before the container was there that was started for them; they count as warm."""
     lost: int
     """Runs that were waiting still when the trace was over."""
     p50_ms: float
@@ -59,7 +63,7 @@ class Outcome(Struct, frozen=True, kw_only=True):
 
 
 class _Container:
-    __slots__ = ("cold_ms", "gateway", "id", "image", "memory_mb", "runs", "since")
+    __slots__ = ("cold_ms", "for_run", "gateway", "id", "image", "memory_mb", "runs", "since")
 
     def __init__(self, container_id: str, gateway: "_Gateway", image: str, memory_mb: int, cold_ms: float) -> None:
         self.id = container_id
@@ -67,6 +71,8 @@ class _Container:
         self.image = image
         self.memory_mb = memory_mb
         self.cold_ms = cold_ms
+        self.for_run = False
+        """Started because a run waited, and not used yet."""
         self.runs = 0
         self.since = 0.0
 
@@ -84,6 +90,8 @@ class _Gateway:
         self.memory_mb = 0
         self.containers = 0
         self.waiting: deque[tuple[Arrival, float]] = deque()
+        self.expecting: dict[str, deque[tuple[Arrival, float]]] = {}
+        """Runs whose container is starting, by image."""
         self.ticking = False
 
     def view(self) -> View:
@@ -121,6 +129,8 @@ class Simulation:
         tick_s: how often the pool is gone through (the real one does it twice a second; the figures differ little).
         make_evictor: eviction policy of a gateway instead of the settings'.
         remote_ms: cost of a warm start on another gateway.
+        binds: a run waits for the container that is started for it whatever comes free meanwhile, as where a start
+            belongs to its run (OpenWhisk); the bounds of `clairvoyant` hold for that.
     """
 
     def __init__(
@@ -131,8 +141,10 @@ class Simulation:
         tick_s: float = 5.0,
         make_evictor: Callable[[int], Evictor | None] = lambda _: None,
         remote_ms: float = REMOTE_MS,
+        binds: bool = False,
     ) -> None:
         self._trace = trace
+        self._binds = binds or settings.mode == "cold"
         self._settings = settings
         self._tick_s = tick_s
         self._remote_ms = remote_ms
@@ -181,7 +193,8 @@ class Simulation:
             cold=counts["cold"],
             cold_s=round(self._cold_ms / 1e3, 3),
             waited=counts["waited"],
-            lost=sum(len(gateway.waiting) for gateway in self._gateways),
+            sooner=counts["sooner"],
+            lost=sum(len(gateway.waiting) + sum(map(len, gateway.expecting.values())) for gateway in self._gateways),
             p50_ms=percentile(ordered, 0.5),
             p99_ms=percentile(ordered, 0.99),
             used_gb_s=round(self._used_mb_s / 1024, 3),
@@ -215,7 +228,11 @@ class Simulation:
         elif container is not None:
             self._less(gateway.starting, container.image)
             gateway.costs.add(container.image, container.cold_ms)
-            self._wasted_mb_s += (at - container.since) * container.memory_mb
+            held_mb_s = (at - container.since) * container.memory_mb
+            if container.for_run:
+                self._used_mb_s += held_mb_s
+            else:
+                self._wasted_mb_s += held_mb_s
             self._free(container)
 
     @staticmethod
@@ -268,6 +285,12 @@ class Simulation:
         container = self._new(gateway, image)
         if not known:
             gateway.planner.arrived(image, self._now)
+        if not self._binds:
+            container.for_run = True
+            gateway.starting[image] += 1
+            gateway.expecting.setdefault(image, deque()).append((arrival, since))
+            self._push(self._now + container.cold_ms / 1e3, _READY, gateway, container, 0.0)
+            return True
         gateway.busy[image] += 1
         self._counts["cold"] += 1
         self._cold_ms += container.cold_ms
@@ -275,6 +298,27 @@ class Simulation:
         gateway.costs.add(image, container.cold_ms)
         service_s = arrival.service_s + container.cold_ms / 1e3
         self._push(self._now + service_s, _END, gateway, container, service_s)
+        return True
+
+    def _serve_expecting(self, container: _Container) -> bool:
+        """Give a container that came free to the run of its image that has expected one for longest, if any has."""
+        gateway, image = container.gateway, container.image
+        expecting = gateway.expecting.get(image)
+        if not expecting:
+            return False
+        arrival, since = expecting.popleft()
+        took_ms = (self._now - since) * 1e3
+        if container.for_run:
+            self._counts["cold"] += 1
+            self._cold_ms += took_ms
+        else:
+            self._counts["local"] += 1
+            self._counts["sooner"] += 1
+            took_ms += WARM_MS
+        container.for_run = False
+        self._startups.append(took_ms)
+        gateway.busy[image] += 1
+        self._push(self._now + arrival.service_s, _END, gateway, container, arrival.service_s)
         return True
 
     def _begin(
@@ -318,6 +362,9 @@ class Simulation:
     def _free(self, container: _Container) -> None:
         gateway = container.gateway
         container.since = self._now
+        if self._serve_expecting(container):
+            return
+        container.for_run = False
         gateway.idle[container.id] = container
         gateway.by_image.setdefault(container.image, {})[container.id] = container
         self._offers.setdefault(container.image, {})[container.id] = container
@@ -382,7 +429,8 @@ def simulate(
     mode: Literal["cold", "local", "federated"] | None = None,
     tick_s: float = 5.0,
     make_evictor: Callable[[int], Evictor | None] = lambda _: None,
+    binds: bool = False,
 ) -> Outcome:
-    """Return what the settings make of a trace; `mode` instead of the settings'."""
+    """Return what the settings make of a trace; `mode` instead of the settings', `binds` as for `Simulation`."""
     settings = replace(settings, mode=mode) if mode is not None else settings
-    return Simulation(trace, settings, tick_s=tick_s, make_evictor=make_evictor).run()
+    return Simulation(trace, settings, tick_s=tick_s, make_evictor=make_evictor, binds=binds).run()

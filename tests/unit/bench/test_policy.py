@@ -75,7 +75,7 @@ def test_the_shipped_default_beside_keep_alive_in_a_fleet(monkeypatch: pytest.Mo
     line = in_a_fleet(("bursts",), (1024,), seed=1)["bursts"]["1024"]
     assert line["fewer_at_budget"] >= 30
     assert line[DEFAULT]["wasted_gb"] <= line["keep_alive"]["wasted_gb"]
-    assert 0 < line["bound"] <= line["keep_alive_federated"]["cold_percent"]
+    assert 0 < line["bound"] <= line["keep_alive"]["cold_percent"]
     assert {"lru", "greedy-dual", "histogram", "learned"} < set(line)
     assert isinstance(line["on_frontier"], bool)
 

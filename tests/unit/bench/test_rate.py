@@ -2,7 +2,10 @@
 
 from typing import Any
 
-from appliance.bench.rate import MODES, pool_of, targets
+from msgspec.structs import replace
+
+from appliance.bench.rate import MODES, pool_of, quiet, targets
+from appliance.model import GatewayStatus
 
 
 def ladder(mode: str, spread: str, service_ms: float, p99: dict[str, float | None]) -> dict[str, Any]:
@@ -46,3 +49,12 @@ def test_modes_differ_only_in_how_they_use_their_containers() -> None:
     assert (pools["local"].prewarm, pools["local"].idle_s, pools["local"].keep) == ((), 600.0, "fixed")
     assert pools["cold"].floor == {}
     assert pools["local"].floor == pools["federated"].floor
+
+
+def test_what_the_next_rate_waits_for() -> None:
+    """A gateway with a run, one that waits, or a container that is only starting is not quiet; silence is."""
+    calm = GatewayStatus(id="a", fleet="f", containers=3, ready=3)
+    assert quiet({})
+    assert quiet({"a": calm})
+    for more in ({"running": 1}, {"queue": 1}, {"containers": 4}):
+        assert not quiet({"a": calm, "b": replace(calm, **more)})

@@ -68,6 +68,25 @@ def test_runs_wait_when_everything_is_busy() -> None:
     assert outcome.p99_ms == 1400.0 + WARM_MS
 
 
+def test_a_run_takes_what_comes_free_before_its_own() -> None:
+    """The first ends at 1.5 s, 0.2 s before the second's own would be there; bound to that, the second waits for it."""
+    trace = trace_of((0.0, "a"), (1.2, "a"), duration_s=100.0)
+    outcome = simulate(trace, BARE)
+    assert (outcome.cold, outcome.local, outcome.sooner, outcome.lost) == (1, 1, 1, 0)
+    assert outcome.p50_ms == 300.0 + WARM_MS
+    assert outcome.used_gb_s == 0.5 + 1.0 + 0.5 + 1.0  # a start for a run is no waste, whoever has the container then
+    assert outcome.wasted_gb_s == 97.5 + 98.3
+    bound = simulate(trace, BARE, binds=True)
+    assert (bound.cold, bound.local, bound.sooner) == (2, 0, 0)
+    assert bound.p50_ms == 500.0
+
+
+def test_what_is_expected_when_the_trace_ends_is_lost() -> None:
+    """A run whose container is not there by the end is accounted for."""
+    outcome = simulate(trace_of((0.0, "a"), (99.9, "a"), duration_s=100.0), replace(BARE, idle_s=1.0))
+    assert (outcome.cold, outcome.lost) == (1, 1)
+
+
 def test_the_same_trace_gives_the_same_figures() -> None:
     """Nothing depends on the clock or on chance that is not the trace's."""
     settings = replace(PoolConfig(floor={}), memory_mb=1024, mode="federated")
@@ -98,7 +117,7 @@ def test_no_policy_on_demand_beats_the_bound() -> None:
         for eviction in ("lru", "greedy-dual"):
             settings = replace(BARE, memory_mb=budget_mb, eviction=eviction, idle_s=1e6)
             for make in (lambda _: None, lambda gateway: Belady(trace, gateway)):
-                outcome = simulate(trace, settings, make_evictor=make)
+                outcome = simulate(trace, settings, make_evictor=make, binds=True)
                 [bound] = least_cold(trace, [outcome.wasted_gb_s * 1024])
                 assert bound <= outcome.cold
     first = least_cold(trace, [0.0, 1e18])
@@ -132,7 +151,7 @@ def test_no_policy_on_demand_beats_the_bound_within_its_budget(kind: str) -> Non
                 lambda gateway: Belady(trace, gateway),
                 lambda gateway: Belady(trace, gateway, by_number=True),
             ):
-                assert bound <= simulate(trace, settings, make_evictor=make).cold
+                assert bound <= simulate(trace, settings, make_evictor=make, binds=True).cold
 
 
 def test_the_bound_falls_with_the_budget() -> None:
