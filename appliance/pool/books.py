@@ -175,7 +175,8 @@ class Books:
     def hold(self, container: PooledContainer, reservation: str) -> None:
         """Hold a container for the lease under this name."""
         container.reservation = reservation
-        container.lease_until = time.monotonic() + self._config.lease_s
+        container.busy_since = time.monotonic()
+        container.lease_until = container.busy_since + self._config.lease_s
         container.become(ContainerState.RESERVED)
         self.changed()
 
@@ -227,6 +228,7 @@ class Books:
     def busy(self, container: PooledContainer, run_id: str) -> None:
         """Note that a run has it."""
         container.reservation = ""
+        container.busy_since = time.monotonic()
         container.become(ContainerState.BUSY, run=run_id)
         self.changed()
 

@@ -114,6 +114,8 @@ class PooledContainer:
         self.reservation = ""
         self.lease_until = 0.0
         self.idle_since = time.monotonic()
+        self.busy_since = 0.0
+        """When it was last reserved or given a run."""
         self.next_probe = 0.0
         self.missed_probes = 0
         self.rss_mb = 0.0

@@ -8,18 +8,22 @@ from appliance.pool.books import Books
 from appliance.pool.policies import ColdCosts, Idle, View
 
 
-def glance(books: Books, costs: ColdCosts, *, budget_mb: int, capacity: int, blocked: Iterable[str]) -> View:
+def glance(
+    books: Books, costs: ColdCosts, *, now: float, budget_mb: int, capacity: int, blocked: Iterable[str]
+) -> View:
     """Return what there is.
 
     Args:
         books: who has which container.
         costs: what a cold start of each image costs, for containers that were adopted.
+        now: the clock that runs are timed by, seconds.
         budget_mb: memory that all together may take now.
         capacity: containers at most.
         blocked: images that are not to be started now.
     """
     idle: list[Idle] = []
     busy: Counter[str] = Counter()
+    lasting: Counter[str] = Counter()
     starting: Counter[str] = Counter()
     for container in books:
         info = container.info
@@ -39,9 +43,11 @@ def glance(books: Books, costs: ColdCosts, *, budget_mb: int, capacity: int, blo
                 starting[info.image] += 1
             case _:
                 busy[info.image] += 1
+                lasting[info.image] += (now - container.busy_since) * 1e3 >= costs.of(info.image)
     return View(
         idle=tuple(idle),
         busy=busy,
+        lasting=lasting,
         starting=starting,
         memory_mb=books.memory_mb,
         containers=len(books),

@@ -123,6 +123,7 @@ class Planning:
         return glance(
             self._books,
             self._starts.costs,
+            now=time.monotonic(),
             budget_mb=self.memory.squeeze.budget_mb,
             capacity=self._config.capacity,
             blocked=self._starts.problems(self._images),

@@ -20,6 +20,8 @@ class View(Struct, frozen=True, kw_only=True):
     idle: tuple[Idle, ...] = ()
     busy: dict[str, int] = field(default_factory=dict[str, int])
     """Containers of each image that have a run or are reserved for one."""
+    lasting: dict[str, int] = field(default_factory=dict[str, int])
+    """Of these, how many have been so for longer than a start of their image takes."""
     starting: dict[str, int] = field(default_factory=dict[str, int])
     memory_mb: int = 0
     """Memory of all containers in whatever state."""

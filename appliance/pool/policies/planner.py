@@ -272,7 +272,7 @@ class Planner:
             busy = view.busy.get(image, 0)
             ahead_s = self._ahead_s(image)
             floor = self._settings.floor.get(image, 0)
-            count = firm = sure = max(0, floor - self._soon_free(image, busy, now))
+            count = firm = sure = max(0, floor - self._soon_free(view, image, now))
             why = f"pool.floor keeps {floor} ready"
             while count < view.capacity:
                 reason, surety = self._wants(Level(image, busy + count + 1, busy, ahead_s), now)
@@ -285,13 +285,15 @@ class Planner:
                 wanted[image] = _Wanted(count, firm, sure, why)
         return wanted
 
-    def _soon_free(self, image: str, busy: int, now: float) -> int:
+    def _soon_free(self, view: View, image: str, now: float) -> int:
         """Return how many busy containers of an image count as ready: free again before a new one would be.
 
-        None where runs take longer than a start. Else those beyond what the load keeps busy (`rate`): with two runs a
-        second of 3 ms none is, so that the one of this moment is no reason to start another.
+        None where runs usually take longer than a start, and none of those that do. Else those beyond what the load
+        keeps busy (`rate`): with two runs a second of 3 ms that is none, so that the one of this moment is no reason to
+        start another.
         """
         demand = self._demand.images.get(image)
+        busy = view.busy.get(image, 0) - view.lasting.get(image, 0)
         if not busy or demand is None or demand.service_s * 1e3 >= self._costs.of(image):
             return 0
         load = demand.service_s / max(1e-9, demand.gap_s(now))

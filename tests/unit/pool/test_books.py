@@ -10,6 +10,8 @@ from appliance.errors import PoolError, RefusedError
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool.books import FOR_A_RUN, Books, WithdrawnError
 from appliance.pool.container import PooledContainer
+from appliance.pool.glance import glance
+from appliance.pool.policies import ColdCosts
 from appliance.pool.settings import PoolConfig
 from appliance.pool.turns import Turn
 
@@ -191,3 +193,14 @@ async def test_those_without_a_start_are_served_in_turn_with_those_that_have_one
     assert not second.done()
     books.ready(own)  # its start has ended
     assert await second is own
+
+
+async def test_the_planner_sees_who_has_a_container_for_long() -> None:
+    """A run that takes longer than a start of its image is told apart from one that has just begun."""
+    books, costs = full_books(), ColdCosts(500.0)
+    for name in ("c1", "c2"):
+        books.add(each := container(name, "base"))
+        books.busy(each, f"run of {name}")
+    each.busy_since -= 0.6
+    view = glance(books, costs, now=each.busy_since + 0.6, budget_mb=1024, capacity=4, blocked=())
+    assert (view.busy, view.lasting) == ({"base": 2}, {"base": 1})

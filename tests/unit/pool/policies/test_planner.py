@@ -118,6 +118,8 @@ def test_the_floor_counts_what_is_free_soon(gap_s: float, service_s: float, busy
         planner.arrived("base", at)
         planner.ended("base", service_s, at + min(service_s, gap_s))
     assert len(planner.tend(busy_view(0, busy), at + gap_s)[0]) == starts
+    # Those that have taken longer than a start already are not expected to be free soon, however short the others were.
+    assert len(planner.tend(replace(busy_view(0, busy), lasting={"base": busy}), at + gap_s)[0]) == 1
     # With nothing busy the floor is what is ready.
     assert len(planner.tend(busy_view(0, 0), at + gap_s)[0]) == 1
 
@@ -181,6 +183,7 @@ def situations(draw: st.DrawFn) -> tuple[PoolConfig, Planner, View]:
         for number, image in enumerate(draw(st.lists(st.sampled_from(IMAGES), max_size=8)))
     )
     busy = {image: draw(st.integers(0, 2)) for image in IMAGES}
+    lasting = {image: draw(st.integers(0, busy[image])) for image in IMAGES}
     starting = {image: draw(st.integers(0, 1)) for image in IMAGES}
     others = [image for counts in (busy, starting) for image in counts for _ in range(counts[image])]
     memory_mb = sum(each.memory_mb for each in idle) + sum(SIZES[image] for image in others)
@@ -188,6 +191,7 @@ def situations(draw: st.DrawFn) -> tuple[PoolConfig, Planner, View]:
     view = View(
         idle=idle,
         busy=busy,
+        lasting=lasting,
         starting=starting,
         memory_mb=memory_mb,
         containers=containers,
