@@ -84,6 +84,8 @@ class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Messages from which a secret was taken."""
     incidents: int = 0
     last_incident: str = ""
+    unwritten_incidents: int = 0
+    """Of them, those that wait in memory until there is room on the disk."""
     held: int = 0
     """Messages that wait in the ring for an incident."""
     removed: int = 0

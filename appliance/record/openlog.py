@@ -65,6 +65,8 @@ class OpenLog:
         """Messages that are not in a whole chunk yet: what a failing write loses."""
         self.gaps: list[Gap] = []
         """Gaps among them."""
+        self.marks: list[Incident] = []
+        """Incidents among them."""
         self._config = config
         self._schemas = schemas
         self._foxglove = foxglove
@@ -117,6 +119,7 @@ class OpenLog:
 
     def add_incident(self, incident: Incident, *, now_ns: int) -> None:
         """Write down what happened."""
+        self.marks.append(incident)  # waits for room again when the file fails before it is whole
         at_ns = incident.at_ns if 0 < incident.at_ns <= LAST_NS else now_ns
         self.put(self._keys.recorder_incident(self._config.name), at_ns, msgspec.json.encode(incident))
 
@@ -161,6 +164,7 @@ class OpenLog:
         self.file.flush()
         self.unflushed = 0
         self.gaps.clear()
+        self.marks.clear()
         self._loose = False
         self._unsynced = True
 

@@ -249,6 +249,7 @@ class Recorder:
             redacted=self._pipeline.redactor.count,
             incidents=self._pipeline.gate.incidents,
             last_incident=self._pipeline.gate.last,
+            unwritten_incidents=writer.waiting_marks,
             held=self._pipeline.gate.held,
             removed=writer.removed,
         )

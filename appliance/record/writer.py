@@ -2,7 +2,8 @@
 
 Synchronous and without threads or network, with clock, free space and file passed in, so that every way a disk
 can fail is tried in a test. It never raises for the disk's sake: it pauses, says why in `problem`, counts what
-it could not write, and goes on by itself when there is space again, with a `Gap` in the log.
+it could not write, and goes on by itself when there is space again, with a `Gap` in the log and the incidents that
+happened meanwhile.
 """
 
 import errno
@@ -37,9 +38,20 @@ NOT_HEARD = "not heard"
 """Reason of a gap that is not the recorder's doing."""
 MOST_PLANS = 200
 """Attachments that wait for the next flush."""
+MOST_MARKS = 1_000
+"""Incidents that wait for room on the disk: some 300 KB. The first ones are kept, which are nearest to the cause."""
 _FIRST_RETRY_S = 1.0
 _LAST_RETRY_S = 30.0
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def file_prefix(fleet: str, name: str) -> str:
+    """Return what the file names of a fleet's recorder begin with; no two recorders have the same.
+
+    A dash within the fleet's name is doubled: recorder `c` of fleet `a-b` and recorder `b-c` of fleet `a` may share a
+    folder, and the budget of one must not take the files of the other.
+    """
+    return f"{fleet.replace('-', '--')}-{name}-"
 
 
 class LogWriter:
@@ -78,7 +90,7 @@ class LogWriter:
         self.not_heard: dict[str, int] = {}
         self.removed = 0
         """Old files removed to stay within `total_bytes`."""
-        self._prefix = f"{fleet}-{config.name}-"
+        self._prefix = file_prefix(fleet, config.name)
         keys = Keys(fleet)
         self._schemas = KeySchemas(keys)
         self._foxglove = Foxglove(keys, config.name, site=site)
@@ -86,6 +98,7 @@ class LogWriter:
         self._clock, self._wall, self._free, self._open_file = clock, wall, free, open_file
         self._current: OpenLog | None = None
         self._gaps: dict[tuple[str, str], Gap] = {}
+        self._marks: list[Incident] = []
         self._waiting: list[Attached] = []
         self._retry_at = float("-inf")
         self._retry_s = _FIRST_RETRY_S
@@ -107,6 +120,11 @@ class LogWriter:
     def file_bytes(self) -> int:
         """Its size so far."""
         return self._current.file.tell() if self._current else 0
+
+    @property
+    def waiting_marks(self) -> int:
+        """Incidents that are in no file yet, for want of room."""
+        return len(self._marks)
 
     def prepare(self) -> None:
         """Make the folder and see that files can be made there; RecordError with the remedy otherwise."""
@@ -153,12 +171,13 @@ class LogWriter:
         self._note(gap)
 
     def mark(self, incident: Incident) -> None:
-        """Write an incident down, and have what leads up to it on the disk soon."""
+        """Write an incident down as soon as there is room for it, and have what leads up to it on the disk soon."""
+        self._keep(incident)
         current = self._current or self._ready()
         if current is None:
             return
         try:
-            current.add_incident(incident, now_ns=self._wall())
+            self._write_marks(current)
         except OSError as error:
             self._fail(error)
 
@@ -176,6 +195,7 @@ class LogWriter:
             return
         try:
             self._write_gaps(current)
+            self._write_marks(current)
             if now - self._flushed_at >= self.config.flush_s:
                 self._flushed_at = now
                 if current.flush(self._take_attached(), now_ns=self._wall(), sync=self.config.fsync):
@@ -196,12 +216,13 @@ class LogWriter:
     def close(self) -> None:
         """Finish the file, with its summary, as far as the disk allows; the next message begins another."""
         current = self._current
-        if current is None and self._gaps:
+        if current is None and (self._gaps or self._marks):
             self._retry_at = float("-inf")
             current = self._ready()
         if current is not None:
             try:
                 self._write_gaps(current)
+                self._write_marks(current)
             except OSError as error:
                 self._fail(error)
                 return
@@ -222,6 +243,13 @@ class LogWriter:
                 last_key=gap.last_key or old.last_key,
             )
         self._gaps[gap.reason, gap.source] = gap
+
+    def _keep(self, incident: Incident) -> None:
+        """Have an incident wait to be written; beyond the bound it is counted with the messages that were dropped."""
+        if len(self._marks) < MOST_MARKS:
+            self._marks.append(incident)
+        else:
+            self.drop(self._reason, self._schemas.keys.recorder_incident(self.config.name), 0, incident.at_ns)
 
     def _ready(self) -> OpenLog | None:
         """Return the file to write in, opening one when it is time; None while there is no space."""
@@ -293,6 +321,11 @@ class LogWriter:
         for which in list(self._gaps):
             current.add_gap(self._gaps.pop(which), now_ns=self._wall())
 
+    def _write_marks(self, current: OpenLog) -> None:
+        """Write down the incidents that wait; those that a failing file takes with it come back (`_fail`)."""
+        while self._marks:
+            current.add_incident(self._marks.pop(0), now_ns=self._wall())
+
     def _take_attached(self) -> tuple[Attached, ...]:
         out, self._waiting = tuple(self._waiting), []
         return out
@@ -322,6 +355,9 @@ class LogWriter:
         if current is not None:
             for gap in current.gaps:
                 self._note(gap)
+            waiting, self._marks = [*current.marks, *self._marks], []
+            for mark in waiting:
+                self._keep(mark)
             if current.unflushed:
                 self.drop("disk full" if full else "write error", "", 0, self._wall(), count=current.unflushed)
                 self.messages -= current.unflushed

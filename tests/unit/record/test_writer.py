@@ -13,11 +13,11 @@ from mcap.reader import make_reader
 from appliance.errors import ConfigError, RecordError
 from appliance.model import LogLine, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import Gap, LoggedMessage
+from appliance.record.facts import Gap, Incident, LoggedMessage
 from appliance.record.logfile import LogFile
 from appliance.record.reader import info, read
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
+from appliance.record.writer import MOST_MARKS, LogWriter, file_prefix
 
 KEYS = Keys("f1")
 JSON = "application/json"
@@ -89,6 +89,10 @@ def _gaps(files: list[Path]) -> list[Gap]:
         for path in files
         for message in read(path, keys=KEYS.recorder_gap("*"))
     ]
+
+
+def _marks(files: list[Path]) -> list[str]:
+    return [incident.reason for path in files for incident in info(path).incidents]
 
 
 def test_finished_file_is_valid_mcap(tmp_path: Path) -> None:
@@ -235,6 +239,34 @@ def test_two_starts_in_a_second_make_two_files(tmp_path: Path) -> None:
     assert _numbers([*first.files, *second.files]) == [0, 1]
 
 
+names = st.text("ab.-", min_size=1, max_size=5).filter(lambda each: each[0] in "ab")
+
+
+@given(st.tuples(names, names), st.tuples(names, names))
+def test_no_two_recorders_have_the_same_file_names(one: tuple[str, str], other: tuple[str, str]) -> None:
+    """Recorders that share a folder call their files differently whatever dashes are in names."""
+    assert (file_prefix(*one) == file_prefix(*other)) == (one == other)
+    assert file_prefix("a-b", "c") != file_prefix("a", "b-c")
+
+
+def test_the_budget_of_one_fleet_leaves_the_files_of_another(tmp_path: Path) -> None:
+    """Recorder `c` of fleet `a-b` in a folder with recorder `b-c` of fleet `a` removes old files of its own only."""
+    clock = Clock()
+    plain = {"directory": str(tmp_path), "free_bytes": 0, "fsync": False, "chunk_bytes": 300, "compression": "none"}
+    other = LogWriter(RecordConfig(name="b-c", **plain), fleet="a", clock=clock)
+    other.write(_message(0))
+    other.close()
+    config = RecordConfig(name="c", rotate_bytes=2_000, total_bytes=4_000, **plain)
+    writer = LogWriter(config, fleet="a-b", clock=clock)
+    for number in range(100):
+        writer.write(_message(number))
+        clock.now += 1
+        writer.tick()
+    writer.close()
+    assert writer.removed
+    assert other.files[0].exists()
+
+
 def test_drops_are_written_down(tmp_path: Path) -> None:
     """What the intake dropped is in the log as one gap with number, bytes and times, and in the file's account."""
     writer = _writer(tmp_path)
@@ -284,10 +316,55 @@ def test_free_disk_floor(tmp_path: Path) -> None:
     assert [(gap.reason, gap.dropped) for gap in _gaps(writer.files)] == [("disk full", 2)]
 
 
+def test_incidents_wait_for_room(tmp_path: Path) -> None:
+    """What happens while the disk is full is marked once there is room; until then it is counted as waiting."""
+    clock, disk = Clock(), Disk(900)
+    config = RecordConfig(directory=str(tmp_path), free_bytes=1000, fsync=False)
+    writer = LogWriter(config, fleet="f1", clock=clock, free=disk.free)
+    for number in range(2):
+        writer.mark(Incident(reason=f"no room {number}", at_ns=1000 + number))
+    assert (writer.waiting_marks, writer.files) == (2, [])
+    disk.left = 5000
+    clock.now += 2
+    writer.mark(Incident(reason="room", at_ns=1010))
+    assert writer.waiting_marks == 0
+    writer.close()
+    assert _marks(writer.files) == ["no room 0", "no room 1", "room"]
+    assert writer.dropped == {}
+
+
+def test_incidents_wait_without_messages(tmp_path: Path) -> None:
+    """Where only incidents are recorded, and nothing comes any more: what waits is written when there is room."""
+    clock, disk = Clock(), Disk(900)
+    config = RecordConfig(directory=str(tmp_path), free_bytes=1000, fsync=False, mode="incidents")
+    writer = LogWriter(config, fleet="f1", clock=clock, free=disk.free)
+    writer.mark(Incident(reason="no room", at_ns=1000))
+    disk.left = 5000
+    clock.now += 2
+    writer.tick()
+    writer.close()
+    assert _marks(writer.files) == ["no room"]
+
+
+def test_incidents_beyond_the_bound_are_counted(tmp_path: Path) -> None:
+    """Of a flood of incidents on a full disk the first are kept; the log tells how many more there were."""
+    clock, disk = Clock(), Disk(900)
+    config = RecordConfig(directory=str(tmp_path), free_bytes=1000, fsync=False)
+    writer = LogWriter(config, fleet="f1", clock=clock, free=disk.free)
+    for number in range(MOST_MARKS + 5):
+        writer.mark(Incident(reason=str(number), at_ns=1000 + number))
+    disk.left = 1 << 30
+    clock.now += 60
+    writer.tick()
+    writer.close()
+    assert _marks(writer.files) == [str(number) for number in range(MOST_MARKS)]
+    assert [(gap.reason, gap.dropped) for gap in _gaps(writer.files)] == [("disk full", 5)]
+
+
 @settings(max_examples=60, deadline=None)
 @given(left=st.integers(0, 6000), more=st.integers(0, 6000))
 def test_full_disk_at_every_byte(tmp_path_factory: pytest.TempPathFactory, left: int, more: int) -> None:
-    """Wherever the disk runs full: every message is in a readable file or in a gap, and none is in both."""
+    """Wherever the disk runs full: every message is in a readable file or in a gap, none in both; all incidents are."""
     clock, disk = Clock(), Disk(left)
     config = RecordConfig(
         directory=str(tmp_path_factory.mktemp("log")), free_bytes=0, fsync=False, chunk_bytes=500, compression="none"
@@ -295,6 +372,8 @@ def test_full_disk_at_every_byte(tmp_path_factory: pytest.TempPathFactory, left:
     writer = LogWriter(config, fleet="f1", clock=clock, open_file=disk.open, free=lambda _: 1 << 40)
     for number in range(120):
         writer.write(_message(number))
+        if number % 10 == 0:
+            writer.mark(Incident(reason=str(number), at_ns=1000 + number))
         clock.now += 0.2
         writer.tick()
         if number == 60:
@@ -308,6 +387,7 @@ def test_full_disk_at_every_byte(tmp_path_factory: pytest.TempPathFactory, left:
     assert numbers[-1] == 120
     assert len(numbers) + sum(gap.dropped for gap in _gaps(writer.files)) == 121
     assert writer.messages == len(numbers)
+    assert _marks(writer.files) == [str(number) for number in range(0, 120, 10)]
     for path in writer.files:
         with path.open("rb") as stream:
             assert sum(1 for _ in make_reader(stream).iter_messages()) == info(path).messages
