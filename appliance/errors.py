@@ -17,17 +17,43 @@
     └── CancelledByOperatorError  somebody asked for it to stop
 
 `code` travels over Zenoh in an error reply and is turned back into the same class on the other side.
-`exit_code` is what the command line ends with (docs/configuration.md lists them).
+`exit_code` is what the command line ends with, one of `Exit`.
 """
 
+from enum import IntEnum, unique
 from typing import ClassVar
+
+
+@unique
+class Exit(IntEnum):
+    """What a command ends with; no other place gives these numbers a meaning (docs/configuration.md is made of it)."""
+
+    DONE = 0
+    """done"""
+    FAILED = 1
+    """it failed: a task or robot that did not do it, a replay that differs, an unreadable log, an internal error"""
+    USAGE = 2
+    """the command line or a configuration is wrong"""
+    UNREACHABLE = 3
+    """nobody answered (no gateway, robot or server)"""
+    REFUSED = 4
+    """refused or not found, and nothing was changed: no valid plan; unknown robot, skill, task or place; a full
+    gateway; a record that has moved on since it was read (a conflict); a robot that a pilot has"""
+    MISSING = 5
+    """something the machine must have is missing (`swiftbot doctor` says what)"""
+    LATE = 6
+    """no result in time"""
+    CANCELLED = 7
+    """cancelled"""
+    INTERRUPTED = 130
+    """interrupted"""
 
 
 class SwiftbotError(Exception):
     """Base of all errors of this product: `message` says what happened, `remedy` what to do about it."""
 
     code: ClassVar[str] = "internal"
-    exit_code: ClassVar[int] = 1
+    exit_code: ClassVar[Exit] = Exit.FAILED
 
     def __init__(self, message: str, *, remedy: str = "", retry_after_s: float = 0.0) -> None:
         super().__init__(message)
@@ -45,28 +71,28 @@ class ConfigError(SwiftbotError):
     """A configuration file or option is wrong."""
 
     code = "config"
-    exit_code = 2
+    exit_code = Exit.USAGE
 
 
 class PayloadError(SwiftbotError):
     """A message is malformed or too large; it was counted and dropped."""
 
     code = "payload"
-    exit_code = 4
+    exit_code = Exit.REFUSED
 
 
 class PrerequisiteError(SwiftbotError):
     """Something the machine must have is missing."""
 
     code = "prerequisite"
-    exit_code = 5
+    exit_code = Exit.MISSING
 
 
 class UnreachableError(SwiftbotError):
     """No gateway, robot or server answered."""
 
     code = "unreachable"
-    exit_code = 3
+    exit_code = Exit.UNREACHABLE
 
     def __init__(self, message: str, *, remedy: str = "", retry_after_s: float = 0.0, sent: bool = False) -> None:
         super().__init__(message, remedy=remedy, retry_after_s=retry_after_s)
@@ -78,34 +104,35 @@ class DeadlineError(SwiftbotError):
     """No result within the time allowed."""
 
     code = "deadline"
-    exit_code = 6
+    exit_code = Exit.LATE
 
 
 class ConflictError(SwiftbotError):
     """The record has moved on since it was read: read, decide again, retry."""
 
     code = "conflict"
+    exit_code = Exit.REFUSED
 
 
 class NotFoundError(SwiftbotError):
     """What was named does not exist."""
 
     code = "not-found"
-    exit_code = 4
+    exit_code = Exit.REFUSED
 
 
 class RefusedError(SwiftbotError):
     """Understood and declined; the message is the reason."""
 
     code = "refused"
-    exit_code = 4
+    exit_code = Exit.REFUSED
 
 
 class PlanError(SwiftbotError):
     """No valid plan for the instruction; `problems` lists what is wrong with the best attempt."""
 
     code = "plan"
-    exit_code = 4
+    exit_code = Exit.REFUSED
 
     def __init__(self, message: str, *, remedy: str = "", problems: tuple[str, ...] = ()) -> None:
         super().__init__(message, remedy=remedy)
@@ -128,6 +155,7 @@ class TakenError(RobotError):
     """A pilot or a failsafe at the vehicle has it: whoever commands it is to wait until it is given back."""
 
     code = "taken"
+    exit_code = Exit.REFUSED
 
 
 class RecordError(SwiftbotError):
@@ -140,7 +168,7 @@ class CancelledByOperatorError(SwiftbotError):
     """Somebody asked for it to stop."""
 
     code = "cancelled"
-    exit_code = 7
+    exit_code = Exit.CANCELLED
 
 
 def _tree(root: type[SwiftbotError]) -> dict[str, type[SwiftbotError]]:

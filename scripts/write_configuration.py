@@ -64,15 +64,6 @@ variables `SWIFTBOT_FLEET`, `SWIFTBOT_DIR` and `SWIFTBOT_CONNECT` say the same.
 
 | code | meaning |
 | --- | --- |
-| 0 | done |
-| 1 | it failed: a task that did not succeed, a replay that differs, an internal error |
-| 2 | the command line or a configuration is wrong |
-| 3 | nobody answered (no gateway, robot or server) |
-| 4 | refused or not found: no valid plan, unknown robot, skill, task or place, a full gateway |
-| 5 | something the machine must have is missing (`swiftbot doctor` says what) |
-| 6 | no result in time |
-| 7 | cancelled |
-| 130 | interrupted |
 """
 
 
@@ -104,9 +95,21 @@ def _default(field: "msgspec.structs.FieldInfo") -> str:
     return "a section of its own" if isinstance(value, msgspec.Struct) else msgspec.json.encode(value).decode()
 
 
+def exits() -> list[tuple[int, str]]:
+    """Number and meaning of each exit code, in source order."""
+    kind = importlib.import_module("appliance.errors").Exit
+    body = next(node for node in ast.parse(inspect.getsource(kind)).body if isinstance(node, ast.ClassDef)).body
+    texts = [
+        " ".join(node.value.value.split())
+        for node in body[1:]
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    ]
+    return [(int(code), text) for code, text in zip(kind, texts, strict=True)]
+
+
 def page() -> str:
     """The whole page."""
-    parts = [HEAD]
+    parts = [HEAD + "\n".join(f"| {code} | {text} |" for code, text in exits()) + "\n"]
     for section, module, name in SECTIONS:
         kind = getattr(importlib.import_module(module), name)
         title = f"`[{section}]`" if section else "Top level"

@@ -1,8 +1,6 @@
 """`swiftbot …`: parses arguments and prints; the work is done in the rooms.
 
-Exit codes: 0 done; 1 it failed (a task that did not succeed, an internal error); 2 the command line or a
-configuration is wrong; 3 nobody answered; 4 refused or not found; 5 something the machine must have is missing;
-6 too late; 7 cancelled; 130 interrupted.
+What it ends with is one of `appliance.errors.Exit`.
 """
 
 import sys
@@ -27,7 +25,7 @@ from appliance.cli import (
     train,
     work,
 )
-from appliance.errors import SwiftbotError
+from appliance.errors import Exit, SwiftbotError
 
 app = App(
     name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
@@ -42,9 +40,9 @@ def main(arguments: list[str] | None = None) -> None:
     logs.configure(level="warning", style="text")
     try:
         code = app(arguments, exit_on_error=False, print_error=True, result_action="return_value")
-        code = code if isinstance(code, int) else 0
+        code = code if isinstance(code, int) else Exit.DONE
     except CycloptsError:
-        code = 2
+        code = Exit.USAGE
     except SwiftbotError as error:
         # Messages hold what people and robots wrote: brackets in them are no markup.
         console.err.print(f"[red]error:[/red] {escape(error.message)}", markup=True)
@@ -52,5 +50,5 @@ def main(arguments: list[str] | None = None) -> None:
             console.err.print(f"  remedy: {error.remedy}", markup=False)
         code = error.exit_code
     except KeyboardInterrupt:
-        code = 130
+        code = Exit.INTERRUPTED
     sys.exit(code)

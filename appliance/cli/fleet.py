@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from appliance import console
 from appliance.cli.common import FLEET, HERE, Where
-from appliance.errors import ConfigError
+from appliance.errors import ConfigError, Exit
 
 
 def add_to(app: App) -> None:
@@ -108,4 +108,4 @@ def demo(
 
     asks = [each for each in ask if each.strip()]
     good = asyncio.run(demonstration.run(_order(where, gateways, robots, site, rate), asks=asks, tui=tui, keep=keep))
-    return 0 if good else 1
+    return Exit.DONE if good else Exit.FAILED

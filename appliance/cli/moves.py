@@ -9,7 +9,7 @@ from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.cli.work import task_app
 from appliance.client import FleetClient
-from appliance.errors import SwiftbotError
+from appliance.errors import Exit, SwiftbotError
 from appliance.tasks.migration.api import DrainState, MigrateAsk, Migrated
 
 LOOK_S = 0.5
@@ -47,7 +47,7 @@ def task_migrate(
 
     moved = asyncio.run(go())
     show(moved, as_json=as_json, table=_told(moved))
-    return 0 if moved.started else 1
+    return Exit.DONE if moved.started else Exit.FAILED
 
 
 async def _call_off(client: FleetClient, task: str, subtask: str) -> None:
@@ -96,7 +96,7 @@ def drain(
 
     state = asyncio.run(go())
     show(state, as_json=as_json, table=_progress(state))
-    return 0 if state.done or not wait else 1
+    return Exit.DONE if state.done or not wait else Exit.FAILED
 
 
 def undrain(gateway: str, *, why: Why = "", as_json: Json = False, where: Where = HERE) -> int:

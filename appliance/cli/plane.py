@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from appliance import console
 from appliance.cli.common import HERE, TOOLS, Json, Where, show
-from appliance.errors import ConfigError, NotFoundError, PayloadError
+from appliance.errors import ConfigError, Exit, NotFoundError, PayloadError
 
 plane_app = App(name="plane", help="Records of the fleet's plane: read, list, compare and set.", group=TOOLS)
 
@@ -176,7 +176,7 @@ def ls(
     show(told, as_json=as_json, table=held_table(listed))
     for name, error in sorted(failed.items()):
         console.err.print(f"{name} does not answer: {error}", markup=False)
-    return 3 if failed else 0
+    return Exit.UNREACHABLE if failed else Exit.DONE
 
 
 def _version(text: str) -> dict[str, int]:

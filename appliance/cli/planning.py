@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
-from appliance.errors import ConfigError, RefusedError
+from appliance.errors import ConfigError, Exit
 
 
 def add_to(app: App) -> None:
@@ -89,7 +89,7 @@ def _batch(cases: Path, out: Path, tier: str, model: str, config: Path | None, *
         f"{report.planless} cases without a plan, {len(report.malformed)} lines left out"
     )
     show(report, as_json=as_json, table=text)
-    return RefusedError.exit_code if report.malformed else 0
+    return Exit.REFUSED if report.malformed else Exit.DONE
 
 
 def experience(

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.client import FleetClient
-from appliance.errors import ConfigError
+from appliance.errors import ConfigError, Exit
 from appliance.pool.api import WarmAsk
 from appliance.reasons import why_text
 from appliance.tasks.why import why
@@ -97,7 +97,7 @@ def pool_warm(
         )
         return found.ready >= count or not wait
 
-    return 0 if asyncio.run(go()) else 1
+    return Exit.DONE if asyncio.run(go()) else Exit.FAILED
 
 
 @pool_app.command(name="evict")

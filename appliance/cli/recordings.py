@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from appliance import console
 from appliance.cli.common import HERE, TOOLS, Json, Where, show
-from appliance.errors import ConfigError, DeadlineError
+from appliance.errors import ConfigError, DeadlineError, Exit
 
 log_app = App(name="log", help="Look into MCAP logs, mend, replay and check them.", group=TOOLS)
 
@@ -140,7 +140,7 @@ def log_cat(
         return 0
     for problem in damaged:
         console.err.print(f"! {problem}", markup=False)
-    return 1 if damaged else 0
+    return Exit.FAILED if damaged else Exit.DONE
 
 
 @log_app.command(name="pin")
@@ -182,7 +182,7 @@ def log_check(paths: tuple[Path, ...], *, as_json: Json = False) -> int:
     with console.err.status("reading") as status:
         report = check(paths, progress=lambda count: status.update(f"{count:,} messages"))
     show(report, as_json=as_json, table=console.check_summary(report))
-    return 0 if report.same else 1
+    return Exit.DONE if report.same else Exit.FAILED
 
 
 @log_app.command(name="trigger")
@@ -268,4 +268,4 @@ def log_replay(
     with console.err.status("reading") as status:
         played = asyncio.run(replay(paths, options, fleet=onto, listen=endpoints, connect=connect, tell=status.update))
     show(played, as_json=as_json, table=console.played_text(played))
-    return 0 if played.ended else 130
+    return Exit.DONE if played.ended else Exit.INTERRUPTED

@@ -12,7 +12,7 @@ from cyclopts import App, Parameter
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
-from appliance.errors import ConfigError, RefusedError, SwiftbotError
+from appliance.errors import ConfigError, Exit, RefusedError, SwiftbotError
 from appliance.robots.api import LinkAdd, LinkFacts, LinkList, LinkRemove
 from appliance.robots.settings import MavlinkLink
 
@@ -58,7 +58,7 @@ def robots_links(*, gateway: Gateway = "", as_json: Json = False, where: Where =
     show([found[name] for name in sorted(found)], as_json=as_json, table=links_tables(found))
     for name, error in sorted(failed.items()):
         console.err.print(f"{name} does not answer: {error}", markup=False)
-    return 0 if found else 3
+    return Exit.DONE if found else Exit.UNREACHABLE
 
 
 @links_app.command(name="add")

@@ -15,7 +15,7 @@ from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.cli.work import task_app
 from appliance.client import FleetClient
-from appliance.errors import ConfigError
+from appliance.errors import ConfigError, Exit
 from appliance.model import Plan, TaskRecord
 from appliance.robots.authority.api import StopAnswer
 from appliance.steering import read_plan_file
@@ -96,7 +96,7 @@ def task_check(plan: Path, *, task: str = "", as_json: Json = False, where: Wher
         waits = f"\nwould wait for approval: {found.approval}" if found.approval else ""
         lines = "\n".join(found.problems) or f"valid, hash {found.hash}{waits}"
         show(found, as_json=as_json, table=lines)
-        return 4 if found.problems else 0
+        return Exit.REFUSED if found.problems else Exit.DONE
 
     return asyncio.run(go())
 
@@ -159,7 +159,7 @@ def stop(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE
 
     answer = asyncio.run(go())
     show(answer, as_json=as_json, table=_told(answer))
-    return 1 if answer.silent or answer.problems else 0
+    return Exit.FAILED if answer.silent or answer.problems else Exit.DONE
 
 
 def resume(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE) -> int:
@@ -171,7 +171,7 @@ def resume(*robots: str, why: Why = "", as_json: Json = False, where: Where = HE
 
     answer = asyncio.run(go())
     show(answer, as_json=as_json, table=_told(answer))
-    return 1 if answer.silent else 0
+    return Exit.FAILED if answer.silent else Exit.DONE
 
 
 def _told(answer: StopAnswer) -> str:

@@ -8,6 +8,7 @@ from cyclopts import App, Parameter
 
 from appliance import console
 from appliance.cli.common import HERE, TOOLS, Json, Where, Why, show
+from appliance.errors import Exit
 
 images_app = App(name="images", help="Images that skills run in.", group=TOOLS)
 
@@ -119,4 +120,4 @@ def doctor(*, config: Path | None = None, as_json: Json = False) -> int:
     loaded = configuration.load(config) if config else None
     checks = asyncio.run(run_checks(loaded))
     show(checks, as_json=as_json, table=console.check_table(checks))
-    return 0 if all(check.ok or not check.required for check in checks) else 5
+    return Exit.DONE if all(check.ok or not check.required for check in checks) else Exit.MISSING

@@ -15,7 +15,7 @@ from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import Endpoint, FleetClient
 from appliance.connection import operator_name
 from appliance.console_watch import stream_line
-from appliance.errors import ConfigError, NotFoundError, PayloadError, SwiftbotError
+from appliance.errors import ConfigError, Exit, NotFoundError, PayloadError, SwiftbotError
 from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
 from appliance.tasks.view import view
@@ -104,8 +104,8 @@ async def _cancel(client: FleetClient, task: str) -> None:
 
 def _outcome(record: TaskRecord) -> int:
     if record.state is TaskState.FAILED:
-        return 4 if record.failure is not None and record.failure.code == "plan" else 1
-    return 7 if record.state is TaskState.CANCELLED else 0
+        return Exit.REFUSED if record.failure is not None and record.failure.code == "plan" else Exit.FAILED
+    return Exit.CANCELLED if record.state is TaskState.CANCELLED else Exit.DONE
 
 
 @task_app.command(name="list")

@@ -118,7 +118,7 @@ async def test_the_commands(tmp_path: Path, free_ports: Callable[..., list[int]]
         assert code == 0
         assert b"[bold]" in out
         assert b"the copies agree" in out
-        assert (await _swiftbot(endpoint, "put", "note/1", "x", "--new"))[0] == 1
+        assert (await _swiftbot(endpoint, "put", "note/1", "x", "--new"))[0] == 4
         code, out = await _swiftbot(endpoint, "put", "lock/1", '{"by": 1}', "--quorum", "--json")
         version = json.loads(out)["version"]
         assert code == 0

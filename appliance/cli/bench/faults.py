@@ -4,6 +4,7 @@ import sys
 
 from appliance.cli.bench.common import GOOD, Network, bench_app, measure, say, tell
 from appliance.cli.common import Json
+from appliance.errors import Exit
 
 
 def _faults(named: str) -> tuple[str, ...]:
@@ -54,7 +55,7 @@ def chaos(
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)
-    return 0 if result["held"] else 1
+    return Exit.DONE if result["held"] else Exit.FAILED
 
 
 @bench_app.command
@@ -93,4 +94,4 @@ def history(
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)
-    return 0 if result["held"] else 1
+    return Exit.DONE if result["held"] else Exit.FAILED

@@ -5,6 +5,7 @@ from typing import Any, Literal
 from appliance import console
 from appliance.cli.bench.common import Image, Ints, Lease, bench_app, measure, say, tell
 from appliance.cli.common import Json, show
+from appliance.errors import Exit
 
 
 @bench_app.command
@@ -164,4 +165,4 @@ def takeover(
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)
     wrong = [each for how in ("kill", "freeze", "silent") if how in result for each in result[how]["not_exactly_once"]]
-    return 1 if wrong else 0
+    return Exit.FAILED if wrong else Exit.DONE

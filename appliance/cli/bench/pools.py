@@ -6,6 +6,7 @@ from typing import Literal
 from appliance import console
 from appliance.cli.bench.common import Floats, Image, Ints, Words, bench_app, measure, say, tell
 from appliance.cli.common import Json, show
+from appliance.errors import Exit
 
 
 @bench_app.command
@@ -161,7 +162,9 @@ def soak(*, count: int = 10_000, at_once: int = 3, image: Image = "base", seed: 
 
     result = measure(run(count, at_once=at_once, image=image, seed=seed, progress=say))
     tell(result, as_json=as_json)
-    return 0 if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else 1
+    return (
+        Exit.DONE if not result["census"]["leaks"] and not result["lost"] and result["census"]["flat"] else Exit.FAILED
+    )
 
 
 @bench_app.command

@@ -6,6 +6,7 @@ from cyclopts import Parameter
 
 from appliance.cli.bench.common import bench_app, measure, say, tell
 from appliance.cli.common import Json
+from appliance.errors import Exit
 
 
 @bench_app.command(name="tui")
@@ -39,4 +40,4 @@ def bench_tui(
     ui, targets = result["ui"], result["targets"]
     p95 = ui["key_to_paint_ms"]["p95"]
     met = p95 is not None and p95 <= targets["key_to_paint_p95_ms"]
-    return 0 if met and ui["cpu_share_of_a_core"] <= targets["cpu_share_of_a_core"] else 1
+    return Exit.DONE if met and ui["cpu_share_of_a_core"] <= targets["cpu_share_of_a_core"] else Exit.FAILED

@@ -6,6 +6,7 @@ from typing import Any
 from appliance import console
 from appliance.cli.bench.common import Ints, bench_app, measure, say, tell
 from appliance.cli.common import Json, show
+from appliance.errors import Exit
 
 
 @bench_app.command
@@ -98,7 +99,11 @@ def bench_record(
     show(result, as_json=as_json, table=console.bench_table(result))
     lost = result.get("flow", {}).get("unaccounted", 0)
     taken = result.get("kills", {})
-    return 1 if lost or any(taken.get(each) for each in ("beyond_last_second", "damaged", "holes")) else 0
+    return (
+        Exit.FAILED
+        if lost or any(taken.get(each) for each in ("beyond_last_second", "damaged", "holes"))
+        else Exit.DONE
+    )
 
 
 @bench_app.command(name="table")

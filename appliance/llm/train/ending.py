@@ -5,9 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
-from appliance.errors import SwiftbotError
-
-INTERRUPTED = 130
+from appliance.errors import Exit, SwiftbotError
 
 
 def ended(main: Callable[[Sequence[str]], int]) -> int:
@@ -21,7 +19,7 @@ def ended(main: Callable[[Sequence[str]], int]) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
-        return INTERRUPTED
+        return Exit.INTERRUPTED
 
 
 class Stopping:
