@@ -15,7 +15,7 @@ from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import Endpoint, FleetClient
 from appliance.connection import operator_name
 from appliance.console_watch import stream_line
-from appliance.errors import ConfigError, Exit, NotFoundError, PayloadError, SwiftbotError
+from appliance.errors import ConfigError, Exit, NotFoundError, SwiftbotError
 from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
 from appliance.tasks.view import view
@@ -182,7 +182,7 @@ def _seconds(text: str) -> float | None:
     except ValueError:
         seconds = -1.0
     if not 0 <= seconds < 1e9:
-        raise PayloadError(f"--since {text[:40]!r} is no time", remedy="give seconds, or such as 90s, 5m, 2h, now")
+        raise ConfigError(f"--since {text[:40]!r} is no time", remedy="give seconds, or such as 90s, 5m, 2h, now")
     return seconds
 
 
