@@ -6,20 +6,25 @@ missing reference file is a failure that says how to get it, never a silent skip
 
 import asyncio
 import functools
+import gc
 import inspect
 import os
 import socket
+import sys
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import configuration, settings
 
 # Found examples are printed, not kept: no run depends on an earlier one, and the tree may be read-only.
 # No deadlines: how long an example takes says how busy the machine is.
 settings.register_profile("alone", database=None, deadline=None)
 settings.load_profile("alone")
+if sys.pycache_prefix:
+    # What hypothesis reads out of the sources (their constants) is kept where their bytecode is: a second a process.
+    configuration.set_hypothesis_home_dir(Path(sys.pycache_prefix) / "hypothesis")
 
 ROOT = Path(__file__).resolve().parent.parent
 """The project's root folder."""
@@ -27,11 +32,25 @@ ROOT = Path(__file__).resolve().parent.parent
 
 FEW_EXAMPLES = 10
 """Of each property, when quick feedback is wanted (SWIFTBOT_QUICK=1, as `make check` does)."""
+QUICK = bool(os.environ.get("SWIFTBOT_QUICK"))
+"""Whether it is."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, Any, Any]:
+    """Look for cycles seldom: not while tests are collected nor in what came of it, and rarely afterwards."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.set_threshold(20_000, 20, 50)
+        gc.enable()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Where quick feedback is wanted try fewer examples of each property, and leave out what is marked `thorough`."""
-    if not os.environ.get("SWIFTBOT_QUICK"):
+    if not QUICK:
         return
     thorough = [item for item in items if item.get_closest_marker("thorough")]
     config.hook.pytest_deselected(items=thorough)
@@ -100,6 +119,12 @@ def free_port() -> int:
 def free_udp_port() -> int:
     """Return a loopback UDP port that is free just now."""
     return _ask_port(socket.SOCK_DGRAM)
+
+
+@pytest.fixture(scope="session")
+def quick() -> bool:
+    """Return whether quick feedback is wanted: what goes through a large corpus takes a sample of it then."""
+    return QUICK
 
 
 @pytest.fixture(scope="session")

@@ -2,106 +2,30 @@
 
 import asyncio
 import json
-import threading
 import time
-from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from llm_server import ASK, CATALOGUE, PLAN, Answer, Server, ask, completion, config
 from msgspec.structs import replace
 
 from appliance.errors import ConfigError, DeadlineError, PayloadError, PlanError, SwiftbotError, UnreachableError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import PlanContext
 from appliance.llm.upstream import UpstreamTier
 from appliance.model import (
-    Failure,
-    Plan,
     RobotInfo,
-    Subtask,
-    SubtaskRecord,
-    SubtaskState,
-    TaskRecord,
-    TaskState,
     Tier,
 )
-from appliance.skills.catalogue import load_catalogue
-from appliance.tasks.recovery import rest_of
-from appliance.tasks.replan.splice import problems
 
 pytestmark = pytest.mark.anyio
 
-CATALOGUE = load_catalogue()
-ASK = PlanContext(instruction="Rover_1: go to dock 1")
-PLAN = {
-    "domain": "navigation",
-    "subtasks": [{"id": "s1", "skill": "goto", "robot": "rover_1", "params": {"place": "dock 1"}, "after": []}],
-}
 BAD = {
     "domain": "navigation",
     "subtasks": [{"id": "s1", "skill": "dance", "robot": "rover_1", "params": {}, "after": []}],
 }
-
-Answer = tuple[int, bytes] | float
-"""Status and body, or seconds of silence."""
-
-
-def completion(content: Any, **more: Any) -> tuple[int, bytes]:
-    """Return a chat completion as servers send it."""
-    text = content if isinstance(content, str) else json.dumps(content)
-    choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop", **more}
-    return 200, json.dumps({"id": "c1", "object": "chat.completion", "choices": [choice], "usage": {}}).encode()
-
-
-class Server:
-    """An OpenAI-compatible server that answers as it is told, in order; the last answer stays."""
-
-    def __init__(self) -> None:
-        self.answers: list[Answer | Callable[[dict[str, Any]], Answer]] = []
-        self.asked: list[dict[str, Any]] = []
-        self.paths: list[str] = []
-        self.keys: list[str | None] = []
-        self.closing = threading.Event()
-        server = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                server.handle(self)
-
-            def log_message(self, *_: Any) -> None:
-                """Say nothing."""
-
-        self._http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._http.daemon_threads = True
-        self._thread = threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.02})
-        self._thread.start()
-        self.url = f"http://127.0.0.1:{self._http.server_address[1]}/v1"
-
-    def handle(self, request: BaseHTTPRequestHandler) -> None:
-        """Answer one request."""
-        body = json.loads(request.rfile.read(int(request.headers["content-length"])))
-        self.asked.append(body)
-        self.paths.append(request.path)
-        self.keys.append(request.headers.get("authorization"))
-        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
-        answer = answer(body) if callable(answer) else answer
-        if isinstance(answer, float):
-            self.closing.wait(answer)
-            return
-        status, data = answer
-        request.send_response(status)
-        request.send_header("content-length", str(len(data)))
-        request.end_headers()
-        request.wfile.write(data)
-
-    def close(self) -> None:
-        """Stop."""
-        self.closing.set()
-        self._http.shutdown()
-        self._http.server_close()
-        self._thread.join()
 
 
 @pytest.fixture
@@ -110,22 +34,6 @@ def server() -> Iterator[Server]:
     running = Server()
     yield running
     running.close()
-
-
-def config(server: Server, **more: Any) -> LlmConfig:
-    """Return a configuration that points at the server."""
-    given = {"local_model": "", "upstream_url": server.url, "upstream_model": "big", "upstream_deadline_s": 5.0}
-    return LlmConfig(**given | more)
-
-
-async def ask(server: Server, **more: Any) -> Any:
-    """Put one instruction to an upstream tier and close it."""
-    tier = UpstreamTier(config(server, **more), CATALOGUE)
-    await tier.start()
-    try:
-        return await tier.propose(ASK)
-    finally:
-        await tier.close()
 
 
 async def test_plan_from_a_server(server: Server, tmp_path: Path) -> None:
@@ -269,96 +177,7 @@ async def test_rules_answer_when_the_server_hangs(server: Server) -> None:
     assert time.monotonic() - began < 30
 
 
-def broken_off() -> TaskRecord:
-    """A task whose rover went to dock 1 and could not photograph there."""
-    plan = Plan(
-        domain="navigation",
-        subtasks=(
-            Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock 1"}),
-            Subtask(id="s2", skill="photograph", robot="rover_1", params={"target": "shelf"}, after=("s1",)),
-        ),
-    )
-    failure = Failure(code="robot", message="the camera is dirty")
-    return TaskRecord(
-        id="t",
-        instruction="Rover_1: go to dock 1 and photograph the shelf",
-        state=TaskState.RUNNING,
-        plan=plan,
-        subtasks=(
-            SubtaskRecord(subtask=plan.subtasks[0], state=SubtaskState.SUCCEEDED, result={}),
-            SubtaskRecord(subtask=plan.subtasks[1], state=SubtaskState.FAILED, failure=failure),
-        ),
-    )
-
-
-FILM = {
-    "domain": "media",
-    "subtasks": [
-        {"id": "s1", "skill": "goto", "robot": "rover_1", "params": {"place": "dock 1"}, "after": []},
-        {"id": "s2", "skill": "record_video", "robot": "rover_1", "params": {"target": "shelf"}, "after": ["s1"]},
-    ],
-}
-SAME = {
-    "domain": "media",
-    "subtasks": [
-        {"id": "s1", "skill": "photograph", "robot": "rover_1", "params": {"target": "shelf"}, "after": []},
-    ],
-}
-
-
-async def replan(cascade: Decomposer, record: TaskRecord) -> Any:
-    """Have the rest of a task planned anew, with the checks of the task manager."""
-    return await cascade.replan(
-        record,
-        PlanContext(instruction=record.instruction),
-        problems=lambda plan: problems(record, plan, CATALOGUE.skills),
-        rest=lambda plan: rest_of(record, plan),
-    )
-
-
-async def test_the_rest_of_a_task_is_planned_anew(server: Server) -> None:
-    """The model is told what is done and what failed; a plan that repeats the failure is sent back with the reason."""
-    server.answers = [completion(SAME), completion(FILM)]
-    cascade = Decomposer(config(server, tiers=("upstream",)), CATALOGUE)
-    try:
-        outcome = await replan(cascade, broken_off())
-    finally:
-        await cascade.close()
-    assert [each.skill for each in outcome.plan.subtasks] == ["goto", "record_video"]
-    told = server.asked[0]["messages"][-1]["content"]
-    assert 'Done: {"id":"s1","skill":"goto"' in told
-    assert 'because: "the camera is dirty"' in told
-    assert "this has failed (the camera is dirty)" in server.asked[1]["messages"][-1]["content"]
-
-
-async def test_without_a_model_rules_use_alternatives_or_say_that_they_cannot(server: Server) -> None:
-    """With a server that hangs, rules put the declared alternative in; without one the error names the failure."""
-    server.answers = [30.0]
-    cascade = Decomposer(config(server, upstream_deadline_s=0.2), CATALOGUE)
-    record = broken_off()
-    nothing = replace(record.subtasks[1].subtask, skill="goto", params={"place": "dock 2"})
-    hopeless = replace(record, subtasks=(record.subtasks[0], replace(record.subtasks[1], subtask=nothing)))
-    rover = RobotInfo(id="rover_1", kind="zenoh", uses=("base", "camera"), verbs=("goto", "state", "capture", "record"))
-    try:
-        context = PlanContext(instruction=record.instruction, robots=(rover,))
-        outcome = await cascade.replan(
-            record, context, problems=lambda _: (), rest=lambda plan: rest_of(record, plan)
-        )  # fmt: skip
-        assert [(each.skill, each.robot) for each in outcome.plan.subtasks] == [
-            ("goto", "rover_1"),
-            ("record_video", "rover_1"),
-        ]
-        assert outcome.plan.tier is Tier.RULES
-        with pytest.raises(PlanError, match="rules cannot plan around a failure") as refused:
-            await cascade.replan(hopeless, context, problems=lambda _: (), rest=lambda plan: plan)
-        assert any("s2 (goto) has failed and no alternative" in each for each in refused.value.problems)
-    finally:
-        await cascade.close()
-
-
 # --- cost, offline, keys --------------------------------------------------------------------------------------------
-
-
 async def test_the_days_budget_is_kept(server: Server) -> None:
     """What an answer cost is counted by its usage and the prices; when the day's budget is spent nothing is sent."""
     paid = {"usage": {"prompt_tokens": 1000, "completion_tokens": 100}}

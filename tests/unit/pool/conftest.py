@@ -1,36 +1,23 @@
-"""A container engine without containers: each is the real runner as a plain process, so only Podman is faked.
-
-It exists because the pool's books (reservations, queue, replacement, adoption) are worth testing in a second,
-with real sockets, real forks and real deaths, on a machine that has no Podman.
-"""
+"""Pools without containers, runners without pools, and skills that do what they are told."""
 
 import asyncio
 import contextlib
 import json
-import os
 import shutil
 import signal
 import sys
 import tempfile
 import textwrap
-from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from appliance.errors import PoolError, PrerequisiteError, UnreachableError
-from appliance.model import ContainerInfo, ContainerState, Need, RunEvent, RunRequest, Site
-from appliance.pool import images
-from appliance.pool.engine import ContainerSpec, EngineFacts, Found, FoundImage
-from appliance.pool.pool import Call, Pool
-from appliance.pool.pressure import Reading
-from appliance.pool.selection import Candidate
-from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import RUNNER
-from appliance.pool.state import ALONE, State
 from appliance.skills.catalogue import Catalogue, load_catalogue
+from tests.unit.pool.bench import Bench, until
+from tests.unit.pool.fake_engine import environment
 
 HANDLER = """
 import os, signal, subprocess, sys, time
@@ -207,239 +194,6 @@ def catalogue(skills_dir: Path) -> Catalogue:
     return Catalogue(whole.domains, skills, images)
 
 
-def children_of(parent: int) -> list[int]:
-    """Return the processes that a process has started itself."""
-    found: list[int] = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            # The name before the last bracket may hold anything; after it come the state and the parent.
-            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
-                found.append(int(stat.parent.name))
-    return found
-
-
-class FakeEngine:
-    """The seam to Podman, with the runner as a plain process for a container."""
-
-    def __init__(self, scratch: Path) -> None:
-        self.scratch = scratch
-        self.away = False
-        self.refuse = ""
-        self.missing: set[str] = set()
-        """Images by name that are not there."""
-        self.references: dict[str, str] = {}
-        self.specs: dict[str, ContainerSpec] = {}
-        self.processes: dict[str, asyncio.subprocess.Process] = {}
-        self.created = 0
-        self.calls: Counter[str] = Counter()
-
-    def _called(self, what: str) -> None:
-        self.calls[what] += 1
-        if self.away:
-            raise UnreachableError("Podman's API socket is not there", remedy="start it")
-
-    async def facts(self) -> EngineFacts:
-        """Say that limits are not enforced."""
-        self._called("facts")
-        return EngineFacts(
-            version="fake",
-            cgroup_version="v1",
-            controllers=frozenset(),
-            runtime="runc",
-            storage_driver="none",
-            rootless=True,
-        )
-
-    async def create(self, spec: ContainerSpec) -> str:
-        """Note it."""
-        self._called("create")
-        if any(f"/{name}:" in spec.image for name in self.missing):
-            raise PrerequisiteError(f"create {spec.name}: the image is not there", remedy="build it")
-        self.created += 1
-        name = f"engine-{self.created}"
-        self.specs[name] = spec
-        return name
-
-    async def start(self, container: str) -> None:
-        """Start the runner, with the paths that it would see translated back."""
-        self._called("start")
-        if self.refuse:
-            raise PoolError(f"start {container}: {self.refuse}")
-        spec = self.specs[container]
-        back = {target: source for source, target in spec.binds.items()}
-        file = Path(back["/run/swiftbot"]) / "spec.json"
-        runner = json.loads(file.read_text())
-        for skill in runner["skills"].values():
-            folder = Path(skill["folder"])
-            skill["folder"] = str(Path(back[str(folder.parent)]) / folder.name)
-        file.write_text(json.dumps(runner))
-        scratch = self.scratch / container
-        scratch.mkdir()
-        self.processes[container] = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "runner.main",
-            "--socket", f"{back['/run/swiftbot']}/runner.sock", "--spec", str(file),
-            "--scratch", str(scratch), cwd=RUNNER.parent,
-            env={"PYTHONDONTWRITEBYTECODE": "1", "PATH": os.environ["PATH"]},
-        )  # fmt: skip
-
-    async def remove(self, container: str) -> None:
-        """Kill it."""
-        self._called("remove")
-        self.specs.pop(container, None)
-        await self.kill(container)
-
-    async def kill(self, container: str) -> None:
-        """End a runner as if somebody had, from outside."""
-        process = self.processes.pop(container, None)
-        if process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                process.send_signal(signal.SIGSTOP)  # so that it starts nothing more
-                runs = children_of(process.pid)
-                process.kill()
-                # In a container the kernel ends all others with process 1.
-                for run in runs:
-                    for kill in (os.killpg, os.kill):
-                        with contextlib.suppress(ProcessLookupError):
-                            kill(run, signal.SIGKILL)
-            await process.wait()
-
-    async def logs(self, container: str) -> str:
-        """Say only whose logs these would be."""
-        return f"logs of {container}"
-
-    async def containers(self, labels: Mapping[str, str]) -> list[Found]:
-        """Return those with the labels."""
-        self._called("containers")
-        return [
-            Found(
-                id=name,
-                name=spec.name,
-                running=name in self.processes and self.processes[name].returncode is None,
-                labels=spec.labels,
-            )
-            for name, spec in self.specs.items()
-            if labels.items() <= spec.labels.items()
-        ]
-
-    async def images(self) -> list[FoundImage]:
-        """Return those that are there."""
-        self._called("images")
-        there = [each for name, each in self.references.items() if name not in self.missing]
-        return [FoundImage(id="1", tags=(each,), size_bytes=1, created="") for each in there]
-
-    async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-async def until(true: Callable[[], bool], what: str, *, within_s: float = 60.0) -> None:
-    """Wait until something holds; fails with what it was."""
-    try:
-        async with asyncio.timeout(within_s):
-            while not true():
-                await asyncio.sleep(0.005)
-    except TimeoutError:
-        pytest.fail(f"not within {within_s} s: {what}")
-
-
-class Bench:
-    """A pool on a fake engine, and what a test needs around it."""
-
-    def __init__(self, folder: Path, catalogue: Catalogue) -> None:
-        self.folder = folder
-        self.catalogue = catalogue
-        self.engine = FakeEngine(folder)
-        self.engine.references = {name: images.reference(each, PoolConfig()) for name, each in catalogue.images.items()}
-        self.pools: list[Pool] = []
-        self.changes: list[tuple[ContainerInfo, ...]] = []
-        self.calls: list[Call] = []
-        self.offers: list[Candidate] = []
-        self.avoided: list[set[str]] = []
-        self.memory = Reading()
-
-    async def answer(self, call: Call) -> dict[str, Any]:
-        """Carry out a handler's call."""
-        self.calls.append(call)
-        match call.name:
-            case "command" if call.args["verb"] == "fly":
-                raise UnreachableError("no such robot", remedy="look for it")
-            case "command":
-                return {"at": call.args["args"], "blobs": {"a.png": b"123"}}
-            case "put_artifact":
-                return {"artifact": "abc", "bytes": len(call.args["data"])}
-            case "get_artifact":
-                return {"data": b"\x00\xff"}
-            case _:
-                return {"number": call.number}
-
-    async def find_remote(self, need: Need, avoid: Collection[str]) -> list[Candidate]:
-        """Offer what the test has put there for this image, and note whose will not be used."""
-        self.avoided.append(set(avoid))
-        return [each for each in self.offers if each.container.image == need.image]
-
-    async def pool(self, *, gateway: str = "g1", fleet: str = "f1", state: State = ALONE, **settings: Any) -> Pool:
-        """Return a started pool."""
-        settings = {"floor": {}, "cancel_grace_s": 0.3, "probe_s": 0.2, "mode": "local"} | settings
-        pool = Pool(
-            PoolConfig(**settings),
-            gateway=gateway,
-            fleet=fleet,
-            run_dir=self.folder / "run" / fleet / gateway,
-            catalogue=self.catalogue,
-            site=Site(name="yard"),
-            find_remote=self.find_remote,
-            on_call=self.answer,
-            on_change=self.changes.append,
-            state=state,
-            make_engine=lambda: self.engine,
-            read_memory=lambda: self.memory,
-        )
-        self.pools.append(pool)
-        await pool.start()
-        return pool
-
-    @staticmethod
-    def request(number: int = 1, *, skill: str = "probe", image: str = "base", **more: Any) -> RunRequest:
-        """Return an order to run a skill; `do` and others are its parameters."""
-        deadline_s = more.pop("deadline_s", 10.0)
-        volumes = more.pop("volumes", ())
-        return RunRequest(
-            task="t",
-            subtask=f"s{number}",
-            attempt=1,
-            skill=skill,
-            need=Need(image=image, cpu=0.1, memory_mb=64, volumes=volumes),
-            params=more,
-            deadline_s=deadline_s,
-        )
-
-    async def run(self, pool: Pool, request: RunRequest) -> tuple[RunEvent, list[RunEvent]]:
-        """Select and run; returns the last event and those before."""
-        events: list[RunEvent] = []
-        decision = await pool.select(request.need, allow_remote=False)
-        return await pool.run(request, decision, events.append), events
-
-    @staticmethod
-    async def ready(pool: Pool, count: int, image: str = "base") -> None:
-        """Wait until a pool has so many ready containers of an image."""
-
-        def enough() -> bool:
-            return sum(c.state is ContainerState.READY and c.image == image for c in pool.containers()) == count
-
-        await until(enough, f"{count} ready containers of {image}")
-
-    until = staticmethod(until)
-
-    async def close(self) -> None:
-        """End everything."""
-        for pool in self.pools:
-            await pool.stop(keep_containers=True)
-        for container in list(self.engine.processes):
-            await self.engine.kill(container)
-
-
 @pytest.fixture
 async def bench(short_dir: Path, catalogue: Catalogue) -> AsyncIterator[Bench]:
     """Return a bench with a fake engine."""
@@ -461,7 +215,7 @@ async def zygote(short_dir: Path, skills_dir: Path) -> AsyncIterator[Callable[[]
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "runner.main", "--socket", "runner.sock", "--spec", "spec.json",
         "--scratch", str(short_dir), cwd=folder,
-        env={"PYTHONPATH": str(RUNNER.parent), "PYTHONDONTWRITEBYTECODE": "1", "PATH": os.environ["PATH"]},
+        env={"PYTHONPATH": str(RUNNER.parent), **environment()},
     )  # fmt: skip
     await until((folder / "runner.sock").exists, "the runner's socket")
     opened: list[Connection] = []

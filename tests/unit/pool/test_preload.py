@@ -25,6 +25,7 @@ def preload(ctx):
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return a function that loads handlers, given by name, as a zygote would; further tables by name too."""
     monkeypatch.setattr(preload.gc, "freeze", lambda: None)  # this process is no zygote
+    monkeypatch.setattr(preload, "make_pages_huge", lambda: None)  # and its heap is that of all tests
 
     def do(handlers: dict[str, str], *, proven: bool = False, **tables: dict[str, Any]) -> Loaded:
         skills: dict[str, Any] = {}

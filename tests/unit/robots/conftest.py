@@ -1,6 +1,7 @@
 """A fake of the plane's session for tests of one process: puts are kept, queries go to functions."""
 
-from collections.abc import Awaitable, Callable
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import msgspec
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from appliance.errors import UnreachableError
 from appliance.model import RobotCommand
 from appliance.plane.keys import Keys
+from tests.unit.robots.flown import EVERY_S, Flown
 
 
 class FakeSession:
@@ -68,3 +70,14 @@ def session() -> FakeSession:
 def store() -> FakeStore:
     """Return an empty store."""
     return FakeStore()
+
+
+@pytest.fixture
+async def flown() -> AsyncIterator[Flown]:
+    """A copter on the ground."""
+    each = Flown()
+    life = asyncio.create_task(each.live())
+    await asyncio.sleep(EVERY_S)
+    yield each
+    life.cancel()
+    await asyncio.wait([life])

@@ -76,6 +76,7 @@ def test_with_nothing_in_between_it_is_one_straight_leg(start: paths.Point, goal
     assert paths.plan(start, goal, []) == [goal]
 
 
+@pytest.mark.thorough
 def test_every_place_of_the_demo_s_site_reaches_every_other() -> None:
     """All places of the warehouse are joined by ways with clearance from racks, few turns and no great detours."""
     site = msgspec.to_builtins(load_site("warehouse"))

@@ -139,6 +139,7 @@ async def test_the_pool_screen_says_what_is_left_alone(view: "FakeView") -> None
         assert "load 1.00" not in text
 
 
+@pytest.mark.thorough
 async def test_what_presses_stands_on_every_screen(view: "FakeView") -> None:
     """Stopped robots, and how many plans and questions wait for a person, are in the header until they are not."""
     app = SwiftbotApp(view)

@@ -1,5 +1,6 @@
 """What is typed ahead, and what is typed into fields."""
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
@@ -27,11 +28,9 @@ async def test_keys_typed_ahead_belong_to_the_command(view: "FakeView") -> None:
         for letter in "resume-robots":
             app.post_message(Key("minus" if letter == "-" else letter, letter))
         app.post_message(Key("enter", "\r"))
-        for _ in range(200):
-            await pilot.pause(0.02)
-            if isinstance(app.screen, ConfirmDialog):
-                break
-        assert isinstance(app.screen, ConfirmDialog)
+        async with asyncio.timeout(60):
+            while not isinstance(app.screen, ConfirmDialog):
+                await pilot.pause(0.02)
         assert view.orders.asked == []
 
 
@@ -72,6 +71,7 @@ async def test_names_are_completed_and_history_comes_back(view: "FakeView") -> N
         assert app.screen.query_one(Input).value == "x"
 
 
+@pytest.mark.thorough
 async def test_every_screen_can_be_left_by_its_keys(view: "FakeView") -> None:
     """From each screen, also one without a table, the number keys lead to each other one."""
     app = SwiftbotApp(view)

@@ -56,7 +56,9 @@ def future(view: "FakeView") -> Iterator["FakeView"]:
         yield view
 
 
-@pytest.mark.parametrize("size", [(80, 24), (160, 48)], ids=["80x24", "160x48"])
+@pytest.mark.parametrize(
+    "size", [(80, 24), pytest.param((160, 48), marks=pytest.mark.thorough)], ids=["80x24", "160x48"]
+)
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
