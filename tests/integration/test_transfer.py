@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from transfer_bench import Side, Sides, sides, small_image, tree
+from transfer_bench import MIB, Side, Sides, fill, moved, same, sides, small_image, tree
 
 from appliance.errors import CancelledByOperatorError, NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.plane.keys import Keys
@@ -21,8 +21,6 @@ from appliance.pool.transfer.archive import Digests
 from appliance.pool.transfer.offers import Offer
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(300)]
-
-MIB = 2**20
 
 
 @pytest.fixture
@@ -40,35 +38,14 @@ async def pair(fleet: Sides) -> tuple[Side, Side]:
     return one, other
 
 
-def _fill(megabytes: int) -> Callable[[Path], None]:
-    """Files of that size: one large, many small, a link, a folder; half of it compressible."""
-
-    def write(folder: Path) -> None:
-        (folder / "maps").mkdir(exist_ok=True)
-        (folder / "weights.bin").write_bytes(os.urandom(megabytes * MIB // 2))
-        (folder / "maps" / "log.txt").write_bytes(b"x=1.25 y=3.50 theta=0.10\n" * (megabytes * MIB // 2 // 25))
-        for number in range(50):
-            (folder / "maps" / f"tile-{number}").write_bytes(os.urandom(500))
-        if not (folder / "latest").is_symlink():
-            (folder / "latest").symlink_to("maps/log.txt")
-
-    return write
-
-
-async def _same(one: Side, other: Side, name: str) -> bool:
-    return await asyncio.to_thread(tree, await one.folder(name)) == await asyncio.to_thread(
-        tree, await other.folder(name)
-    )
-
-
 async def test_64_mib_there_and_what_changed_back(
     pair: tuple[Side, Side], record_property: Callable[[str, object], None]
 ) -> None:
     """A volume of 64 MiB arrives whole, known there as newest; back comes only what a run changed there."""
     one, other = pair
-    await one.change("maps", _fill(64))
+    await one.change("maps", fill(64))
     brought = await other.transfers.bring_volume("maps")
-    assert await _same(one, other, "maps")
+    assert await same(one, other, "maps")
     assert brought.gateway == "g0"
     assert brought.size_bytes > 64 * MIB
     assert brought.wire_bytes < 0.6 * brought.size_bytes, "half of it compresses to nothing"
@@ -81,7 +58,7 @@ async def test_64_mib_there_and_what_changed_back(
     assert (await other.transfers.bring_volume("maps")).wire_bytes == 0
     await other.change("maps", lambda folder: (folder / "note").write_text("seen"))
     back = await one.transfers.bring_volume("maps", "g1")
-    assert await _same(one, other, "maps")
+    assert await same(one, other, "maps")
     assert back.wire_bytes < 4 * MIB
     assert back.resumed_bytes > 60 * MIB
     for side in pair:
@@ -127,12 +104,12 @@ async def test_broken_in_the_middle_and_gone_on(fleet: Sides) -> None:
     """The receiver stops in mid-transfer and starts again: only the rest comes; the old state stayed whole."""
     one, other = await fleet.start(0), await fleet.start(1, window=1)
     await fleet.settled()
-    await one.change("maps", _fill(16))
+    await one.change("maps", fill(16))
     await other.transfers.bring_volume("maps")
     before = await asyncio.to_thread(tree, await other.folder("maps"))
-    await one.change("maps", _fill(16))
+    await one.change("maps", fill(16))
     bringing = asyncio.create_task(other.transfers.bring_volume("maps"))
-    await _moved(other, 4 * MIB)
+    await moved(other, 4 * MIB)
     await fleet.stop(1)
     with pytest.raises((asyncio.CancelledError, SwiftbotError)):
         await bringing
@@ -141,25 +118,18 @@ async def test_broken_in_the_middle_and_gone_on(fleet: Sides) -> None:
     assert await asyncio.to_thread(tree, await other.folder("maps")) == before
     brought = await other.transfers.bring_volume("maps")
     assert brought.resumed_bytes >= 4 * MIB
-    assert await _same(one, other, "maps")
-
-
-async def _moved(side: Side, least_bytes: int) -> None:
-    """Wait until so much of a transfer has arrived."""
-    async with asyncio.timeout(60):
-        while not any(each.done_bytes >= least_bytes for each in side.transfers.active()):
-            await asyncio.sleep(0.001)
+    assert await same(one, other, "maps")
 
 
 async def test_cancelled_and_gone_on(fleet: Sides) -> None:
     """A transfer that is cancelled says so, to whoever waits and on its key; the next try goes on where it was."""
     one, other = await fleet.start(0), await fleet.start(1, window=1)
     await fleet.settled()
-    await one.change("maps", _fill(16))
+    await one.change("maps", fill(16))
     seen: list[bytes] = []
     one.plane.session.subscribe(Keys(fleet.fleet).transfer("g1"), lambda message: seen.append(message.payload))
     bringing = asyncio.create_task(other.transfers.bring_volume("maps"))
-    await _moved(other, 4 * MIB)
+    await moved(other, 4 * MIB)
     assert not other.transfers.cancel("nothing")
     assert other.transfers.cancel(other.transfers.active()[0].id)
     with pytest.raises(CancelledByOperatorError):
@@ -168,7 +138,7 @@ async def test_cancelled_and_gone_on(fleet: Sides) -> None:
         while not any(b'"cancelled"' in each for each in seen):
             await asyncio.sleep(0.01)
     assert (await other.transfers.bring_volume("maps")).resumed_bytes >= 4 * MIB
-    assert await _same(one, other, "maps")
+    assert await same(one, other, "maps")
 
 
 GATEWAY = """
@@ -216,7 +186,7 @@ async def test_the_giving_gateway_is_killed_in_the_middle(fleet: Sides) -> None:
     try:
         await fleet.settled(2)
         bringing = asyncio.create_task(here.transfers.bring_volume("maps"))
-        await _moved(here, 4 * MIB)
+        await moved(here, 4 * MIB)
         process.send_signal(signal.SIGKILL)
         with pytest.raises(SwiftbotError):
             await bringing
@@ -238,17 +208,17 @@ async def test_another_gateway_goes_on_where_the_first_broke(fleet: Sides) -> No
     """The first source stops in mid-transfer; another that holds the same state gives the rest within the same call."""
     one, two = await fleet.start(0), await fleet.start(1)
     await fleet.settled()
-    await one.change("maps", _fill(16))
+    await one.change("maps", fill(16))
     await two.transfers.bring_volume("maps")
     three = await fleet.start(2, window=1)
     await fleet.settled()
     three.volumes.hear("g1", two.volumes.infos())
     bringing = asyncio.create_task(three.transfers.bring_volume("maps", "g0"))
-    await _moved(three, 3 * MIB)
+    await moved(three, 3 * MIB)
     await fleet.stop(0)
     brought = await bringing
     assert brought.gateway == "g1"
-    assert await _same(two, three, "maps")
+    assert await same(two, three, "maps")
 
 
 async def test_corrupted_chunks_are_counted_and_never_applied(
@@ -256,10 +226,10 @@ async def test_corrupted_chunks_are_counted_and_never_applied(
 ) -> None:
     """A source whose chunks are damaged on the way is refused and counted; the old state stays; then all is well."""
     one, other = pair
-    await one.change("maps", _fill(4))
+    await one.change("maps", fill(4))
     await other.transfers.bring_volume("maps")
     before = await asyncio.to_thread(tree, await other.folder("maps"))
-    await one.change("maps", _fill(4))
+    await one.change("maps", fill(4))
     real = Offer.chunk
 
     def damaged(self: Offer, index: int, *, zstd: bool) -> bytes:
@@ -274,7 +244,7 @@ async def test_corrupted_chunks_are_counted_and_never_applied(
     assert await asyncio.to_thread(tree, await other.folder("maps")) == before
     monkeypatch.undo()
     await other.transfers.bring_volume("maps")
-    assert await _same(one, other, "maps")
+    assert await same(one, other, "maps")
 
 
 FULL = """
@@ -311,7 +281,7 @@ asyncio.run(main())
 async def test_a_real_disk_that_is_full(fleet: Sides) -> None:
     """On a file system of 8 MiB a volume of 16 is refused with a remedy, and nothing of it is left there."""
     one = await fleet.start(0)
-    await one.change("maps", _fill(16))
+    await one.change("maps", fill(16))
     # In a user namespace the service user may mount a tmpfs of its own.
     command = ["podman", "unshare", sys.executable, "-c", FULL, str(Path(__file__).parent), str(fleet.folder / "g2")]
     command += [fleet.fleet, fleet.endpoints[2], fleet.endpoints[0]]
@@ -328,10 +298,10 @@ async def test_a_real_disk_that_is_full(fleet: Sides) -> None:
 async def test_no_room_to_unpack(pair: tuple[Side, Side], monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk fills while the state is unpacked: the old one stays whole, nothing is left beside it."""
     one, other = pair
-    await one.change("maps", _fill(4))
+    await one.change("maps", fill(4))
     await other.change("maps", lambda folder: (folder / "own").write_text("mine"))
     for _ in range(2):
-        await one.change("maps", _fill(4))
+        await one.change("maps", fill(4))
     folder = await other.folder("maps")
     real, calls = os.fchmod, 0
 
@@ -350,7 +320,7 @@ async def test_no_room_to_unpack(pair: tuple[Side, Side], monkeypatch: pytest.Mo
     assert [each.name for each in folder.parent.iterdir()] == ["_data"]
     brought = await other.transfers.bring_volume("maps")
     assert brought.wire_bytes == 0, "what had arrived was kept"
-    assert await _same(one, other, "maps")
+    assert await same(one, other, "maps")
     [kept] = await other.storage.volumes({LABEL_KEPT: "maps", "swiftbot.fleet": other.fleet})
     assert (kept.folder / "own").read_text() == "mine"
 
@@ -358,14 +328,14 @@ async def test_no_room_to_unpack(pair: tuple[Side, Side], monkeypatch: pytest.Mo
 async def test_many_ask_for_one_volume_at_once(pair: tuple[Side, Side]) -> None:
     """Ten that want the same volume share one transfer; one who gives up waiting does not end it for the others."""
     one, other = pair
-    await one.change("maps", _fill(8))
+    await one.change("maps", fill(8))
     asking = [asyncio.create_task(other.transfers.bring_volume("maps")) for _ in range(10)]
-    await _moved(other, 1)
+    await moved(other, 1)
     asking[0].cancel()
     done = await asyncio.gather(*asking, return_exceptions=True)
     assert isinstance(done[0], asyncio.CancelledError)
     assert len({repr(each) for each in done[1:]}) == 1
-    assert await _same(one, other, "maps")
+    assert await same(one, other, "maps")
 
 
 # --- images -----------------------------------------------------------------------------------------------------

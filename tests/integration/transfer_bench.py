@@ -5,6 +5,7 @@ import contextlib
 import hashlib
 import io
 import json
+import os
 import secrets
 import tarfile
 from collections.abc import AsyncIterator, Callable
@@ -19,6 +20,8 @@ from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.settings import TransferConfig
 from appliance.pool.transfer.transfers import Transfers
 from appliance.pool.volumes import Volumes
+
+MIB = 2**20
 
 
 class Side:
@@ -170,3 +173,32 @@ def _tar(files: dict[str, bytes]) -> bytes:
             info.size = len(data)
             tar.addfile(info, io.BytesIO(data))
     return out.getvalue()
+
+
+def fill(megabytes: int) -> Callable[[Path], None]:
+    """Files of that size: one large, many small, a link, a folder; half of it compressible."""
+
+    def write(folder: Path) -> None:
+        (folder / "maps").mkdir(exist_ok=True)
+        (folder / "weights.bin").write_bytes(os.urandom(megabytes * MIB // 2))
+        (folder / "maps" / "log.txt").write_bytes(b"x=1.25 y=3.50 theta=0.10\n" * (megabytes * MIB // 2 // 25))
+        for number in range(50):
+            (folder / "maps" / f"tile-{number}").write_bytes(os.urandom(500))
+        if not (folder / "latest").is_symlink():
+            (folder / "latest").symlink_to("maps/log.txt")
+
+    return write
+
+
+async def same(one: Side, other: Side, name: str) -> bool:
+    """Whether a volume is the same at both."""
+    return await asyncio.to_thread(tree, await one.folder(name)) == await asyncio.to_thread(
+        tree, await other.folder(name)
+    )
+
+
+async def moved(side: Side, least_bytes: int) -> None:
+    """Wait until so much of a transfer has arrived."""
+    async with asyncio.timeout(60):
+        while not any(each.done_bytes >= least_bytes for each in side.transfers.active()):
+            await asyncio.sleep(0.001)
