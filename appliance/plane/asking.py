@@ -14,6 +14,7 @@ import zenoh
 
 from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
 from appliance.plane import link
+from appliance.plane.direct import Direct
 from appliance.plane.doors import Doors
 from appliance.plane.publishing import Message
 from appliance.plane.wire import Wire
@@ -24,9 +25,10 @@ log = structlog.get_logger(__name__)
 class Asking:
     """The questions under way of one session."""
 
-    def __init__(self, wire: Wire, doors: Doors) -> None:
+    def __init__(self, wire: Wire, doors: Doors, direct: Direct) -> None:
         self._wire = wire
         self._doors = doors
+        self._direct = direct
         self._asking: set[asyncio.Future[bytes]] = set()
 
     async def query(
@@ -34,8 +36,9 @@ class Asking:
     ) -> bytes:
         """Ask whoever serves a key and return the first answer; `bulk`: other messages go before it.
 
-        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full. For small
-        questions that can be asked again, where the way there and back matters.
+        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full, as a plain
+        message where whoever serves the key takes those (`plane.direct`). For small questions that can be asked again,
+        where the way there and back matters.
 
         Raises:
             UnreachableError: nobody serves the key, or (`sent`) whoever may have heard it went away before answering.
@@ -48,22 +51,30 @@ class Asking:
         answer: asyncio.Future[bytes] = self._wire.loop.create_future()
         self._asking.add(answer)
 
-        def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
+        def on_answer(data: bytes | None, error: SwiftbotError | None) -> None:
             if not answer.done():
                 if error is not None:
                     answer.set_exception(error)
                 elif data is not None:
                     answer.set_result(data)
 
+        def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
+            on_answer(data, error)
+
         def on_end(sent: bool) -> None:
             if not answer.done():
                 remedy = "is that gateway or robot up and linked?"
                 answer.set_exception(UnreachableError(f"nobody answers on {key}", remedy=remedy, sent=sent))
 
+        number: int | None = None
         try:
-            target = zenoh.QueryTarget.BEST_MATCHING
-            meant = link.mark(key, direct=direct)
-            self._get(key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, direct=direct, meant=meant)
+            if direct:
+                number = self._direct.ask(key, payload, on_answer, partial(on_end, True))
+            if number is None:
+                target, meant = zenoh.QueryTarget.BEST_MATCHING, link.mark(key, direct=direct)
+                self._get(
+                    key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, direct=direct, meant=meant
+                )
             async with asyncio.timeout_at(until):
                 data = await answer
             if data or not direct:
@@ -73,6 +84,8 @@ class Asking:
         finally:
             self._asking.discard(answer)
             answer.cancel()
+            if number is not None:
+                self._direct.forget(number)
         # The answer is too large to be sent so.
         return await self.query(key, payload, timeout_s=max(0.0, until - self._wire.loop.time()), bulk=bulk)
 

@@ -97,9 +97,9 @@ class Dht:
         voting.learn = self._pushing.learn
         self._unsaved: set[str] = set()
         """Keys whose last decision here the replicas may have and the disk has not."""
-        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, at_once=self._read_at_once)
-        rpc.register("dht_write", Write, self._on_write, exchange=False)
-        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, at_once=self._store_at_once)
+        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, direct=True, at_once=self._read_at_once)
+        rpc.register("dht_write", Write, self._on_write, exchange=False, direct=True)
+        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, direct=True, at_once=self._store_at_once)
         rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
         rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
 

@@ -39,20 +39,25 @@ def reply(
     key = str(query.key_expr) if "*" in expr else expr
     with contextlib.suppress(zenoh.ZError), query:
         if error is not None or answer is None:
-            error = error or SwiftbotError("no answer")
-            problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
-            body = ErrorReply(
-                code=error.code,
-                message=error.message,
-                remedy=error.remedy,
-                problems=problems,
-                retry_after_s=error.retry_after_s,
-            )
-            query.reply_err(encode(body), encoding="application/json")
+            query.reply_err(error_body(error or SwiftbotError("no answer")), encoding="application/json")
         elif bulk:
             query.reply(key, answer, encoding="application/octet-stream")
         else:
             query.reply(key, answer, encoding="application/json", express=True)
+
+
+def error_body(error: SwiftbotError) -> bytes:
+    """An error as it is sent."""
+    problems = cast("tuple[str, ...]", getattr(error, "problems", ()))
+    return encode(
+        ErrorReply(
+            code=error.code,
+            message=error.message,
+            remedy=error.remedy,
+            problems=problems,
+            retry_after_s=error.retry_after_s,
+        )
+    )
 
 
 MARK = b"direct "
@@ -62,6 +67,8 @@ MOST_DIRECT = 32 * 1024
 """Larger messages are sent in fragments, and one that is dropped loses all."""
 
 
+MOST_ERROR = 65_536
+"""Bytes that are read of an error."""
 WRONG_DOOR = "the question is not for this"
 
 
@@ -102,7 +109,11 @@ def quietly(send: Callable[[], None], key: str) -> None:
 
 def error_of(error: zenoh.ReplyError | None) -> SwiftbotError:
     """Rebuild the error that the answering side raised."""
-    text = error.payload.to_bytes()[:65_536] if error is not None else b""
+    return error_from(error.payload.to_bytes()[:MOST_ERROR] if error is not None else b"")
+
+
+def error_from(text: bytes) -> SwiftbotError:
+    """Rebuild an error from what was sent."""
     if text == b"Timeout":  # Zenoh's own way of saying so
         return DeadlineError("no answer in time")
     try:

@@ -64,11 +64,13 @@ class Rpc:
         handler: Callable[[Q], Awaitable[Struct]],
         *,
         exchange: bool = True,
+        direct: bool = False,
         at_once: Callable[[Q, AtOnce], bool] | None = None,
     ) -> None:
         """Answer a verb. `exchange=False` is for the plane's own traffic, which would repeat what is put anyway.
 
-        `at_once` is tried first for direct calls, on a thread of Zenoh's (`Session.serve`); bad input is the handler's.
+        `direct` has small questions come as plain messages too; `at_once` is tried first for direct calls, on a thread
+        of Zenoh's (`Session.serve`); bad input is the handler's.
         """
         gateway = self._gateway
         if gateway is None or verb in self._verbs:
@@ -99,7 +101,7 @@ class Rpc:
         quick = None if at_once is None else partial(_at_once, msgspec.json.Decoder(request), at_once)
         self._verbs[verb] = serve
         key = self._session.keys.rpc(gateway, verb)
-        self._closers.append(self._session.serve(key, lambda _, payload: serve(payload), at_once=quick))
+        self._closers.append(self._session.serve(key, lambda _, payload: serve(payload), direct=direct, at_once=quick))
 
     def _publish(self, verb: str, gateway: str, payload: bytes, began: float, outcome: bytes | Exception) -> None:
         reply, error = (outcome, None) if isinstance(outcome, bytes) else (None, _failure(outcome))

@@ -5,8 +5,8 @@ bounded, and one that is malformed or oversize is counted, logged and dropped or
 Nothing that is sent can hang the loop: sends block when a peer is stuck (dropping would lose facts silently), but
 they do so on a thread of their own, and a peer stuck for a lease is disconnected.
 
-Its parts are `publishing` (facts), `answering` and `asking` (questions), `presence` (liveliness tokens) and `doors`
-(links that are mixed up), each around the same `wire`.
+Its parts are `publishing` (facts), `answering` and `asking` (questions), `direct` (small ones, as plain messages),
+`presence` (liveliness tokens) and `doors` (links that are mixed up), each around the same `wire`.
 """
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
@@ -16,8 +16,9 @@ import asyncio
 import zenoh
 
 from appliance.plane import link
-from appliance.plane.answering import Answer, Answering
+from appliance.plane.answering import Answering
 from appliance.plane.asking import Asking
+from appliance.plane.direct import Answer, Direct
 from appliance.plane.doors import Doors
 from appliance.plane.keys import Keys
 from appliance.plane.presence import Presence
@@ -46,7 +47,8 @@ class Session:
         self._sockets = SocketWatch.shared(config.lease_ms)
         doors = Doors(wire, self._sockets)
         publishing, presence = Publishing(wire), Presence(wire)
-        self._answering, self._asking = Answering(wire, doors), Asking(wire, doors)
+        direct = Direct(wire)
+        self._answering, self._asking = Answering(wire, doors, direct), Asking(wire, doors, direct)
         self.put = publishing.put
         self.delete = publishing.delete
         self.flood = publishing.flood

@@ -1,0 +1,206 @@
+"""Small questions between gateways as plain messages: a third less time there and back than a query of Zenoh's.
+
+A query is kept in a table on its way, has a timer, and ends by a message of its own. A direct question is one message
+to a door, `{key}/@direct`, and its answer one to the session that asked, `@answers/{session}`: keys that no wildcard
+matches, so that neither the recorder nor a listener to everything is sent them. What a query tells is told here too:
+
+- that nobody is there: Zenoh knows who listens at a door. Where nobody does, the question goes as a query, which says
+  so; when whoever listened goes, the questions that wait for it end as those that may have been heard;
+- that it came to the wrong door (`doors`): the key it is meant for goes with it. It is asked again as a query then,
+  and so is one whose answer is too large for a message that may be dropped.
+"""
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import zenoh
+
+from appliance.errors import SwiftbotError
+from appliance.plane import link
+from appliance.plane.keys import DOOR
+from appliance.plane.wire import Closer, Wire
+
+Answer = Callable[[bytes | None, SwiftbotError | None], None]
+"""Answers one question, from any thread; an empty answer has it asked again as a query."""
+
+_MOST_WAYS = 256
+_ANSWERED, _FAILED = b"+", b"-"
+_SESSION = frozenset(b"0123456789abcdef")
+_LONGEST = 32
+
+
+class Asked(NamedTuple):
+    """What a question says of itself; `number` and `session` are for its answer."""
+
+    number: int
+    session: str
+    key: bytes
+    """What it is meant for."""
+
+
+class _Waiting(NamedTuple):
+    way: "Way"
+    on_reply: Callable[[bytes | None, SwiftbotError | None], None]
+    on_gone: Callable[[], None]
+
+
+class Way:
+    """The way to one door: says whether anybody listens there."""
+
+    def __init__(self, raw: zenoh.Session, key: str, on_gone: Callable[["Way"], None]) -> None:
+        self.key = key.encode()
+        self._publisher = raw.declare_publisher(
+            f"{key}/{DOOR}",
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_HIGH,
+            express=True,
+        )
+        self.put = self._publisher.put
+        self._on_gone = on_gone
+        handler = zenoh.handlers.Callback(self._changed, indirect=False)
+        self._listener = self._publisher.declare_matching_listener(handler)
+
+    def _changed(self, status: "zenoh.MatchingStatus") -> None:
+        if not status.matching:
+            self._on_gone(self)
+
+    @property
+    def open(self) -> bool:
+        """Whether somebody listens there just now."""
+        # The stubs take the status for a bool; it is a structure with one.
+        return self._publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
+
+    def close(self) -> None:
+        """Forget the way."""
+        self._listener.undeclare()
+        self._publisher.undeclare()
+
+
+class Direct:
+    """The direct questions of one session, asked and answered; asked on the event loop's thread."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        self._session = str(wire.raw.zid())
+        self._ways: OrderedDict[str, Way] = OrderedDict()
+        self._waiting: dict[int, _Waiting] = {}
+        # An answer that Zenoh delivers to the wrong session finds nobody who waits for such a number.
+        self._number = secrets.randbits(62)
+        self._listening: zenoh.Subscriber[None] | None = None
+
+    # --- asking -----------------------------------------------------------------------------------------------
+
+    def ask(
+        self,
+        key: str,
+        payload: bytes,
+        on_reply: Callable[[bytes | None, SwiftbotError | None], None],
+        on_gone: Callable[[], None],
+    ) -> int | None:
+        """Ask whoever listens at the door of `key`; both callbacks come by the event loop.
+
+        Returns:
+            The question's number, to be forgotten (`forget`); None where nobody listens.
+        """
+        if self._wire.closed or self._wire.config.mode != "peer":
+            # For whom a router stands between, each way would be kept there too.
+            return None
+        way = self._ways.get(key) or self._way(key)
+        self._number = number = self._number + 1
+        # Before it is looked whether anybody listens: who goes after that look ends it.
+        self._waiting[number] = _Waiting(way, on_reply, on_gone)
+        if not way.open:
+            del self._waiting[number]
+            return None
+        self._listen()
+        attached = b"%d %s %s" % (number, self._session.encode(), way.key)
+        link.quietly(partial(way.put, payload, attachment=attached), key)
+        return number
+
+    def forget(self, number: int) -> None:
+        """Wait for an answer no more."""
+        self._waiting.pop(number, None)
+
+    def _way(self, key: str) -> Way:
+        while len(self._ways) >= _MOST_WAYS:
+            _, oldest = self._ways.popitem(last=False)
+            self._gone(oldest)
+            oldest.close()
+        way = self._ways[key] = Way(self._wire.raw, key, self._gone)
+        return way
+
+    def _gone(self, way: Way) -> None:
+        """Nobody listens there any more; on a thread of Zenoh's."""
+        for number, each in tuple(self._waiting.items()):
+            if each.way is way and self._waiting.pop(number, None) is not None:
+                self._wire.inbox.post(each.on_gone, must=True)
+
+    def _listen(self) -> None:
+        if self._listening is None:
+            expr = self._wire.keys.answers(self._session)
+            handler = zenoh.handlers.Callback(self._take_answer, indirect=False)
+            self._listening = self._wire.raw.declare_subscriber(expr, handler)
+
+    def _take_answer(self, sample: zenoh.Sample) -> None:
+        raw = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        kind, number = raw[:1], raw[1:]
+        waiting = self._waiting.pop(int(number), None) if number.isdigit() and len(number) < _LONGEST else None
+        if waiting is None:
+            return  # late, or nobody's
+        data = sample.payload
+        if kind == _ANSWERED and len(data) <= link.MOST_DIRECT:
+            self._wire.inbox.post(partial(waiting.on_reply, data.to_bytes(), None), len(data), must=True)
+        else:
+            error = link.error_from(data.to_bytes()[: link.MOST_ERROR])
+            self._wire.inbox.post(partial(waiting.on_reply, None, error), must=True)
+
+    # --- answering --------------------------------------------------------------------------------------------
+
+    def serve(self, key: str, take: Callable[[Asked, zenoh.ZBytes], None]) -> Closer:
+        """Have the questions at the door of `key` delivered, on Zenoh's threads."""
+        self._listen()
+        name = f"malformed {self._wire.name(key)}/{DOOR}"
+
+        def deliver(sample: zenoh.Sample) -> None:
+            asked = _read(sample.attachment.to_bytes()) if sample.attachment is not None else None
+            if asked is None:
+                refuse = partial(self._wire.refuse, name, reason="it does not say who asks what")
+                self._wire.inbox.post(refuse)
+            else:
+                take(asked, sample.payload)
+
+        handler = zenoh.handlers.Callback(deliver, indirect=False)
+        return Closer(self._wire.raw.declare_subscriber(f"{key}/{DOOR}", handler).undeclare)
+
+    def answer(self, asked: Asked, answer: bytes | None, error: SwiftbotError | None) -> None:
+        """Answer a question, from any thread; with nothing where it is to be asked again as a query."""
+        if error is not None or answer is None:
+            kind, body = _FAILED, link.error_body(error or SwiftbotError("no answer"))
+        else:
+            kind, body = _ANSWERED, b"" if len(answer) > link.MOST_DIRECT else answer
+        key = self._wire.keys.answers(asked.session)
+        put = partial(
+            self._wire.raw.put,
+            key,
+            body,
+            attachment=b"%s%d" % (kind, asked.number),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_HIGH,
+            express=True,
+        )
+        link.quietly(put, key)
+
+
+def _read(attached: bytes) -> Asked | None:
+    """What a question says of itself; None where that is not to be read."""
+    number, _, rest = attached.partition(b" ")
+    session, _, key = rest.partition(b" ")
+    if not number.isdigit() or not 1 <= len(session) <= _LONGEST or len(number) >= _LONGEST:
+        return None
+    # It becomes part of a key: nothing else may be.
+    return Asked(int(number), session.decode(), key) if _SESSION.issuperset(session) else None
