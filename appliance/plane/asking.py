@@ -21,6 +21,9 @@ from appliance.plane.wire import Wire
 
 log = structlog.get_logger(__name__)
 
+MOST_ANSWERS = 2_000
+"""To one question that everybody may answer; twice the gateways that a fleet may have."""
+
 
 class Asking:
     """The questions under way of one session."""
@@ -90,7 +93,10 @@ class Asking:
         return await self.query(key, payload, timeout_s=max(0.0, until - self._wire.loop.time()), bulk=bulk)
 
     async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
-        """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out."""
+        """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out.
+
+        At most `MOST_ANSWERS`, and `queue_bytes` of them together: what comes beyond that is counted as refused.
+        """
         messages: list[Message] = []
         ended = asyncio.Event()
 
@@ -127,18 +133,23 @@ class Asking:
             raise UnreachableError("the session is closed")
 
         answered, sender = False, 0
+        # One answer is all that counts of a question to one; whoever is asked may send more.
+        taken = _Bounds(1 if first else MOST_ANSWERS, self._wire.config.queue_bytes)
 
         def take(reply: zenoh.Reply) -> None:
             nonlocal answered
             answered = True
             sample = reply.ok
+            size = len(sample.payload) if sample is not None else 0
+            if not taken.one(0 if first or size > limit else size):
+                return
             if sample is None:
                 error = link.error_of(reply.err)
                 if link.WRONG_DOOR in error.message:
                     replier = str(reply.replier_id.zid) if reply.replier_id is not None else ""
                     self._wire.inbox.post(partial(self._doors.met_wrong, replier))
                 self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
-            elif (size := len(sample.payload)) > limit:
+            elif size > limit:
                 self._wire.inbox.post(partial(self._wire.refuse, "oversize answer", key=expr, size=size))
                 error = PayloadError(f"the answer on {expr} has {size:,} bytes", remedy=f"at most {limit:,}")
                 self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
@@ -148,6 +159,9 @@ class Asking:
                 self._wire.inbox.post(partial(on_reply, key, data, None), size, must=True)
 
         def end() -> None:
+            if taken.left_out and not first:
+                refuse = partial(self._wire.refuse, "answers beyond the limit", count=taken.left_out, key=expr)
+                self._wire.inbox.post(refuse, must=True)
             # Where the first answer is all that counts, waking the event loop for the end after it is for nothing.
             if not (first and answered):
                 # One that nobody serves ends within the call that sends it.
@@ -187,3 +201,22 @@ class Asking:
         for answer in self._asking:
             if not answer.done():
                 answer.set_exception(UnreachableError("the session was closed", sent=True))
+
+
+class _Bounds:
+    """Counts the answers to one question, on whatever threads they come."""
+
+    def __init__(self, most: int, most_bytes: int) -> None:
+        self.left_out = 0
+        self._left, self._left_bytes = most, most_bytes
+        self._lock = threading.Lock()
+
+    def one(self, size: int) -> bool:
+        """Whether one more of that size is within the bounds."""
+        with self._lock:
+            if self._left <= 0 or self._left_bytes < size:
+                self.left_out += 1
+                return False
+            self._left -= 1
+            self._left_bytes -= size
+            return True

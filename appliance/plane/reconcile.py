@@ -68,6 +68,7 @@ class Reconciler:
         pulse: Pulse,
     ) -> None:
         self._config = config
+        self._rpc = rpc
         self._membership = membership
         self._dht = dht
         self._pulse = pulse
@@ -115,6 +116,15 @@ class Reconciler:
         self._hurry.set()
 
     async def _run(self) -> None:
+        while True:
+            try:
+                await self._step_by_step()
+            except Exception as error:  # supervision boundary: a gateway that never compares again loses records
+                log.exception("reconciling broke off and begins anew")
+                self._rpc.refuse("reconciling broke off", reason=f"{type(error).__name__}: {error}")
+            await asyncio.sleep(_AGAIN_S)
+
+    async def _step_by_step(self) -> None:
         settled: Settled | None = None
         tries, wait_s = 0, 0.0
         tidy, handed, waited = False, True, False

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 
 import msgspec
 import pytest
+import zenoh
 
 from appliance.errors import (
     ConfigError,
@@ -22,6 +23,7 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.model import ErrorReply, LogLine, Need, encode
+from appliance.plane import asking
 from appliance.plane.rpc import Exchange, Rpc
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
@@ -373,6 +375,35 @@ async def test_everybody_is_asked(pair: tuple[Session, Session]) -> None:
     assert {(each.key, each.payload) for each in answers} == {
         ("swiftbot/f/all/one", b"hi!"), ("swiftbot/f/all/two", b"hi!"),
     }  # fmt: skip
+
+
+async def test_answers_to_everybody_are_bounded(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more answers than are taken, by number or bytes, the rest is left out and counted; one has one."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    one = await Session.open(PlaneConfig(listen=(endpoint,), queue_bytes=2**20), "f")
+    other = await Session.open(PlaneConfig(connect=(endpoint,)), "f")
+    monkeypatch.setattr(asking, "MOST_ANSWERS", 20)
+
+    def many(query: zenoh.Query) -> None:
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        with query:
+            for number in range(50):
+                query.reply(f"swiftbot/f/many/{number}" if payload else "swiftbot/f/many/0", payload or b"%d" % number)
+
+    handler = zenoh.handlers.Callback(many, indirect=False)
+    queryable = other._wire.raw.declare_queryable("swiftbot/f/many/*", handler, complete=True)
+    await _heard(one, other)
+    few = await one.query_all("swiftbot/f/many/*", b"x", timeout_s=20)
+    assert len({each.key for each in few}) == 20
+    await _until(lambda: one.refused == {"answers beyond the limit": 30})
+    heavy = await one.query_all("swiftbot/f/many/*", b"x" * 200_000, timeout_s=20)
+    assert len(heavy) == 5
+    await _until(lambda: one.refused == {"answers beyond the limit": 75})
+    assert await one.query("swiftbot/f/many/0", b"", timeout_s=20) == b"0"
+    assert one.refused == {"answers beyond the limit": 75}
+    queryable.undeclare()
+    await other.close()
+    await one.close()
 
 
 async def test_tokens_are_seen_by_those_who_come_later(pair: tuple[Session, Session]) -> None:

@@ -1,10 +1,13 @@
 """What a gateway does at rest about members that it does not see any more."""
 
+import asyncio
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, Literal, cast
 
 import pytest
 
+from appliance.plane import reconcile
 from appliance.plane.absence import Absence
 from appliance.plane.comparing import DigestAsk
 from appliance.plane.dht import Dht
@@ -26,6 +29,10 @@ class Bench:
 
     def __init__(self, view: Literal["full"] | int) -> None:
         self.asked: list[str] = []
+        self.failures = 0
+        self.done = asyncio.Event()
+        self.refused: list[str] = []
+        self.on_ring_change: list[Callable[[], None]] = []
         config = PlaneConfig(view=view)
         self.absence = Absence(replicas=config.replicas, whole=view == "full")
         self.returned: frozenset[str] = frozenset()
@@ -51,6 +58,17 @@ class Bench:
         """Nothing is here."""
         return []
 
+    async def settled(self, _: Ring, __: int) -> None:
+        """The shard is compared; fails as often as the test wants."""
+        if self.failures:
+            self.failures -= 1
+            raise RuntimeError("a defect")
+        self.done.set()
+
+    def refuse(self, what: str, **_: object) -> None:
+        """Count."""
+        self.refused.append(what)
+
     async def forget_tombstones(self, _: int) -> None:
         """Nothing is here."""
 
@@ -72,3 +90,25 @@ async def test_those_that_were_lost_are_asked_where_that_can_tell_anything(
             lost(name)
     await bench.reconciler._round(Step(kind=Kind.REST, ring=RING, stalls=0), tidy=False)
     assert sorted(bench.asked) == asked
+
+
+async def test_what_goes_wrong_with_settling_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A defect met when a comparison is done is counted, and the comparison is done again until it is settled."""
+    monkeypatch.setattr(reconcile, "_AGAIN_S", 0.0)
+    bench = Bench("full")
+    bench.failures = 3
+    bench.reconciler.start()
+    async with asyncio.timeout(60):
+        await bench.done.wait()
+    assert bench.refused == ["reconciling broke off"] * 3
+    # And goes on: the next change is heard of.
+    bench.done.clear()
+    bench.failures = 1
+    bench.membership.ring = bench.membership.ring.changed_to(frozenset({"gw-1", "gw-4"}))
+    bench.membership.members = bench.membership.ring.members
+    for joined in bench.membership.on_joined:
+        joined("gw-4")
+    async with asyncio.timeout(60):
+        await bench.done.wait()
+    assert bench.refused == ["reconciling broke off"] * 4
+    await bench.reconciler.close()
