@@ -21,6 +21,7 @@ from appliance.errors import RefusedError
 from appliance.plane.ahead import NOTHING, Ahead, Mark
 from appliance.plane.file import File, problem_of
 from appliance.plane.picture import Picture
+from appliance.plane.room import Room
 from appliance.plane.rows import COLUMNS, from_row, prefixed, put_row, read_row
 from appliance.plane.versions import Record, digest
 
@@ -308,8 +309,12 @@ class Store:
             self._post(self._opened, None, error)
             return
         self._post(self._opened, None, None)
+        room = Room(self.path)
         while batch := self._take():
             self._do(db, batch)
+            if any(call.durable for call in batch if call.writes):
+                room.make()
+        room.close()
         with contextlib.suppress(sqlite3.Error):
             db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.close()
