@@ -32,7 +32,8 @@ class Asking:
         self._wire = wire
         self._doors = doors
         self._direct = direct
-        self._asking: set[asyncio.Future[bytes]] = set()
+        self.open: set[asyncio.Future[bytes]] = set()
+        """Answers that are awaited."""
 
     async def query(
         self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
@@ -49,48 +50,13 @@ class Asking:
             PayloadError: the request or the answer is too large.
             SwiftbotError: what the answering side raised.
         """
-        direct = direct and len(payload) <= link.MOST_DIRECT
-        until = self._wire.loop.time() + timeout_s
-        answer: asyncio.Future[bytes] = self._wire.loop.create_future()
-        self._asking.add(answer)
+        return await self.ask(key, payload, timeout_s=timeout_s, bulk=bulk, direct=direct).answer()
 
-        def on_answer(data: bytes | None, error: SwiftbotError | None) -> None:
-            if not answer.done():
-                if error is not None:
-                    answer.set_exception(error)
-                elif data is not None:
-                    answer.set_result(data)
-
-        def on_reply(_: str, data: bytes | None, error: SwiftbotError | None) -> None:
-            on_answer(data, error)
-
-        def on_end(sent: bool) -> None:
-            if not answer.done():
-                remedy = "is that gateway or robot up and linked?"
-                answer.set_exception(UnreachableError(f"nobody answers on {key}", remedy=remedy, sent=sent))
-
-        number: int | None = None
-        try:
-            if direct:
-                number = self._direct.ask(key, payload, on_answer, partial(on_end, True))
-            if number is None:
-                target, meant = zenoh.QueryTarget.BEST_MATCHING, link.mark(key, direct=direct)
-                self._get(
-                    key, payload, timeout_s, on_reply, on_end, target=target, bulk=bulk, direct=direct, meant=meant
-                )
-            async with asyncio.timeout_at(until):
-                data = await answer
-            if data or not direct:
-                return data
-        except TimeoutError:
-            raise DeadlineError(f"no answer on {key} within {timeout_s:g} s") from None
-        finally:
-            self._asking.discard(answer)
-            answer.cancel()
-            if number is not None:
-                self._direct.forget(number)
-        # The answer is too large to be sent so.
-        return await self.query(key, payload, timeout_s=max(0.0, until - self._wire.loop.time()), bulk=bulk)
+    def ask(
+        self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
+    ) -> "Question":
+        """Do the same, but only send the question, and have the answer awaited afterwards."""
+        return Question(self, self._wire, self._direct, key, payload, timeout_s, bulk=bulk, direct=direct)
 
     async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
         """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out.
@@ -106,13 +72,13 @@ class Asking:
             elif error is not None:
                 log.debug("an answer is an error", expr=expr, error=str(error))
 
-        self._get(expr, payload, timeout_s, on_reply, lambda _: ended.set(), target=zenoh.QueryTarget.ALL)
+        self.get(expr, payload, timeout_s, on_reply, lambda _: ended.set(), target=zenoh.QueryTarget.ALL)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await ended.wait()
         return list(messages)
 
-    def _get(
+    def get(
         self,
         expr: str,
         payload: bytes,
@@ -125,6 +91,7 @@ class Asking:
         direct: bool = False,
         meant: bytes | None = None,
     ) -> None:
+        """Send a query; both callbacks come by the event loop, `on_end` only where no answer came first."""
         first = target != zenoh.QueryTarget.ALL
         limit = self._wire.config.max_payload_bytes
         if len(payload) > limit:
@@ -198,9 +165,91 @@ class Asking:
 
     def stop(self) -> None:
         """End every question under way with an error."""
-        for answer in self._asking:
+        for answer in self.open:
             if not answer.done():
                 answer.set_exception(UnreachableError("the session was closed", sent=True))
+
+
+class Question:
+    """A question that is under way; what went wrong with sending it is told with the answer."""
+
+    def __init__(
+        self,
+        asking: Asking,
+        wire: Wire,
+        ways: Direct,
+        key: str,
+        payload: bytes,
+        timeout_s: float,
+        *,
+        bulk: bool,
+        direct: bool,
+    ) -> None:
+        self._asking, self._ways = asking, ways
+        self._key, self._payload = key, payload
+        self._timeout_s, self._until = timeout_s, wire.loop.time() + timeout_s
+        self._bulk, self._direct = bulk, direct and len(payload) <= link.MOST_DIRECT
+        self._loop = wire.loop
+        self._answer: asyncio.Future[bytes] = wire.loop.create_future()
+        self._number: int | None = None
+        asking.open.add(self._answer)
+        try:
+            self._send()
+        except SwiftbotError as error:
+            self._answer.set_exception(error)
+
+    def _send(self) -> None:
+        if self._direct:
+            self._number = self._ways.ask(self._key, self._payload, self._on_answer, partial(self._on_end, True))
+        if self._number is None:
+            self._asking.get(
+                self._key,
+                self._payload,
+                self._timeout_s,
+                self._on_reply,
+                self._on_end,
+                target=zenoh.QueryTarget.BEST_MATCHING,
+                bulk=self._bulk,
+                direct=self._direct,
+                meant=link.mark(self._key, direct=self._direct),
+            )
+
+    def _on_answer(self, data: bytes | None, error: SwiftbotError | None) -> None:
+        if not self._answer.done():
+            if error is not None:
+                self._answer.set_exception(error)
+            elif data is not None:
+                self._answer.set_result(data)
+
+    def _on_reply(self, _: str, data: bytes | None, error: SwiftbotError | None) -> None:
+        self._on_answer(data, error)
+
+    def _on_end(self, sent: bool) -> None:
+        remedy = "is that gateway or robot up and linked?"
+        self._on_answer(None, UnreachableError(f"nobody answers on {self._key}", remedy=remedy, sent=sent))
+
+    async def answer(self) -> bytes:
+        """Wait for the answer; errors as of `Asking.query`, whose time has run since the question was sent."""
+        try:
+            async with asyncio.timeout_at(self._until):
+                data = await self._answer
+            if data or not self._direct:
+                return data
+        except TimeoutError:
+            raise DeadlineError(f"no answer on {self._key} within {self._timeout_s:g} s") from None
+        finally:
+            self.end()
+        # The answer is too large to be sent so.
+        left_s = max(0.0, self._until - self._loop.time())
+        return await self._asking.query(self._key, self._payload, timeout_s=left_s, bulk=self._bulk)
+
+    def end(self) -> None:
+        """Wait for it no more; more than once does no harm."""
+        self._asking.open.discard(self._answer)
+        if not self._answer.cancel() and not self._answer.cancelled():
+            self._answer.exception()  # looked at: nobody else may come to
+        if self._number is not None:
+            self._ways.forget(self._number)
 
 
 class _Bounds:

@@ -278,16 +278,18 @@ class Dht:
             Its version, once they and this gateway agree.
         """
         others = [each for each in self._replicas(record.key) if each != self._gateway]
-        pushed = asyncio.gather(*(self._pushing.push(each, record, durable=asked.durable) for each in others))
+        pushes = [self._pushing.begin(each, record, durable=asked.durable) for each in others]
         try:
             await committed
-        except BaseException as error:
-            pushed.cancel()
-            if isinstance(error, SwiftbotError):
-                # The replicas may have it: before the next decision on this key they are asked.
-                self._unsaved.add(record.key)
+            # All are on their way: the slowest is what is waited for.
+            answers = [await each.done() for each in pushes]
+        except SwiftbotError:
+            # The replicas may have it: before the next decision on this key they are asked.
+            self._unsaved.add(record.key)
             raise
-        answers = await pushed
+        finally:
+            for each in pushes:
+                each.end()
         newer = [answer for answer in answers if answer is not None]
         if not newer:
             return record.version

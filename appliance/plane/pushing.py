@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
 from typing import Any
 
 import structlog
@@ -10,7 +11,7 @@ import structlog
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, StoreAsk
-from appliance.plane.rpc import Rpc
+from appliance.plane.rpc import Call, Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 from appliance.plane.versions import Record
@@ -21,6 +22,22 @@ _ASK_S = 1.5
 _AGAIN_S = (0.5, 2.0)
 """When a replica that was too slow for a write is offered the record again."""
 _MOST = 256
+
+
+class Push:
+    """A record on its way to a replica."""
+
+    def __init__(self, call: Call[Found], heard: Callable[[Call[Found]], Awaitable[Record | None]]) -> None:
+        self._call = call
+        self._heard = heard
+
+    async def done(self) -> Record | None:
+        """Wait until the replica has stored it, or is away, slow or failing; returns what it holds instead."""
+        return await self._heard(self._call)
+
+    def end(self) -> None:
+        """Wait for it no more."""
+        self._call.end()
 
 
 class Pushing:
@@ -44,12 +61,19 @@ class Pushing:
         self._keep = keep
         self._pushes: set[asyncio.Task[None]] = set()
 
-    async def push(self, gateway: str, record: Record, *, durable: bool = True) -> Record | None:
+    def begin(self, gateway: str, record: Record, *, durable: bool = True) -> "Push":
+        """Send a replica a record to store; what comes of it is awaited afterwards."""
+        ask, timeout_s = StoreAsk(record, durable), self._config.replica_timeout_s
+        call = self._rpc.begin(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
+        return Push(call, partial(self._heard, gateway, record))
+
+    async def push(self, gateway: str, record: Record) -> Record | None:
         """Have a replica store a record; returns what it holds if that is something else."""
-        timeout_s = self._config.replica_timeout_s
+        return await self.begin(gateway, record).done()
+
+    async def _heard(self, gateway: str, record: Record, call: Call[Found]) -> Record | None:
         try:
-            ask = StoreAsk(record, durable)
-            answer = await self._rpc.call(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
+            answer = await call.answer()
         except UnreachableError:
             return None  # gone: its successor in the replica set takes the record when it reconciles
         except (DeadlineError, RefusedError) as error:

@@ -8,13 +8,14 @@ import hashlib
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 from msgspec import Raw, Struct
 
 from appliance.errors import ConfigError, PayloadError, SwiftbotError
 from appliance.model import ErrorReply, encode
+from appliance.plane.asking import Question
 from appliance.plane.session import Answer, Closer, Session
 
 Q = TypeVar("Q", bound=Struct)
@@ -44,6 +45,31 @@ class Digest(Struct, frozen=True):
 
     bytes: int
     sha256: str
+
+
+class Call(Generic[R]):
+    """A request that is under way."""
+
+    def __init__(self, session: Session, question: Question, gateway: str, verb: str, reply: type[R]) -> None:
+        self._session = session
+        self._question = question
+        self._gateway, self._verb, self._reply = gateway, verb, reply
+
+    async def answer(self) -> R:
+        """Wait for the answer; errors as of `Rpc.call`."""
+        answer = await self._question.answer()
+        try:
+            return msgspec.json.decode(answer, type=self._reply)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            key = self._session.keys.rpc(self._gateway, self._verb)
+            self._session.refuse(f"malformed answer {self._verb}", key=key, reason=str(error))
+            raise PayloadError(
+                f"{self._gateway} answered {self._verb} with no {self._reply.__name__}: {error}"
+            ) from error
+
+    def end(self) -> None:
+        """Wait for it no more."""
+        self._question.end()
 
 
 class Rpc:
@@ -126,13 +152,15 @@ class Rpc:
         direct: bool = False,
     ) -> R:
         """Ask a gateway; `direct` and errors as of `Session.query`, and PayloadError when the answer is no `reply`."""
+        return await self.begin(gateway, verb, request, reply, timeout_s=timeout_s, direct=direct).answer()
+
+    def begin(
+        self, gateway: str, verb: str, request: Struct, reply: type[R], *, timeout_s: float, direct: bool = False
+    ) -> "Call[R]":
+        """Do the same, but only send the request, and have the answer awaited afterwards."""
         key = self._session.keys.rpc(gateway, verb)
-        answer = await self._session.query(key, encode(request), timeout_s=timeout_s, direct=direct)
-        try:
-            return msgspec.json.decode(answer, type=reply)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            self._session.refuse(f"malformed answer {verb}", key=key, reason=str(error))
-            raise PayloadError(f"{gateway} answered {verb} with no {reply.__name__}: {error}") from error
+        question = self._session.ask(key, encode(request), timeout_s=timeout_s, direct=direct)
+        return Call(self._session, question, gateway, verb, reply)
 
     def close(self) -> None:
         """Answer no more."""

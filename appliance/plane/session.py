@@ -56,6 +56,7 @@ class Session:
         self.subscribe_typed = publishing.subscribe_typed
         self.serve = self._answering.serve
         self.query = self._asking.query
+        self.ask = self._asking.ask
         self.query_all = self._asking.query_all
         self.declare_alive = presence.declare_alive
         self.alive_now = presence.alive_now

@@ -213,7 +213,9 @@ class Store:
                 each.set_result(record)
             return True
         done, mark = partial(self._post, committed), Mark(decided=record)
-        self._submit(_Call(partial(self._put, record), done, writes=True, durable=durable, mark=mark))
+        self._submit(_Call(partial(self._put, record), done, writes=True, durable=durable, mark=mark), wake=False)
+        # The store's thread wants the interpreter, and so does whoever sends the decision to others now: that first.
+        self._loop.call_soon(self._wake)
         decided.set_result(record)
         return True
 
@@ -289,7 +291,7 @@ class Store:
         self._submit(_Call(run, partial(self._post, future), writes, durable, mark))
         return cast("T", await future)
 
-    def _submit(self, call: _Call) -> None:
+    def _submit(self, call: _Call, *, wake: bool = True) -> None:
         with self._some:
             if self._closing:
                 raise RefusedError("the store is closed")
@@ -299,6 +301,11 @@ class Store:
                 )
             self._waiting.append(call)
             self._ahead.queued(call.mark)
+            if wake:
+                self._some.notify()
+
+    def _wake(self) -> None:
+        with self._some:
             self._some.notify()
 
     def _run(self) -> None:

@@ -65,6 +65,16 @@ class _Door:
         return dict(self.came)[payload]
 
 
+async def _heard(speaker: Session, listener: Session) -> None:
+    """Wait until the speaker knows what the listener listens to."""
+    heard = asyncio.Event()
+    closer = listener.subscribe("swiftbot/f/probe", lambda _: heard.set())
+    while not heard.is_set():
+        speaker.put("swiftbot/f/probe", b"")
+        await asyncio.sleep(0.01)
+    closer.close()
+
+
 async def _echo(key: str, payload: bytes) -> bytes:
     return payload
 
@@ -146,6 +156,7 @@ async def test_whoever_goes_ends_what_waits_for_it(pair: tuple[Session, Session]
             await asyncio.Event().wait()
         return payload
 
+    await _heard(one, other)  # a link that is only just there may have something asked over it all the same
     with pytest.raises(UnreachableError) as nobody:
         await one.query(KEY, b"x", timeout_s=60, direct=True)
     assert not nobody.value.sent
