@@ -193,6 +193,7 @@ class Question:
         self._answer: asyncio.Future[bytes] = wire.loop.create_future()
         self._number: int | None = None
         asking.open.add(self._answer)
+        self._timer = wire.loop.call_at(self._until, self._on_time)
         try:
             self._send()
         except SwiftbotError as error:
@@ -228,15 +229,15 @@ class Question:
         remedy = "is that gateway or robot up and linked?"
         self._on_answer(None, UnreachableError(f"nobody answers on {self._key}", remedy=remedy, sent=sent))
 
+    def _on_time(self) -> None:
+        self._on_answer(None, DeadlineError(f"no answer on {self._key} within {self._timeout_s:g} s"))
+
     async def answer(self) -> bytes:
         """Wait for the answer; errors as of `Asking.query`, whose time has run since the question was sent."""
         try:
-            async with asyncio.timeout_at(self._until):
-                data = await self._answer
+            data = await self._answer
             if data or not self._direct:
                 return data
-        except TimeoutError:
-            raise DeadlineError(f"no answer on {self._key} within {self._timeout_s:g} s") from None
         finally:
             self.end()
         # The answer is too large to be sent so.
@@ -245,6 +246,7 @@ class Question:
 
     def end(self) -> None:
         """Wait for it no more; more than once does no harm."""
+        self._timer.cancel()
         self._asking.open.discard(self._answer)
         if not self._answer.cancel() and not self._answer.cancelled():
             self._answer.exception()  # looked at: nobody else may come to
