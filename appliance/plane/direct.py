@@ -12,6 +12,7 @@ matches, so that neither the recorder nor a listener to everything is sent them.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
+import contextlib
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable
@@ -184,16 +185,16 @@ class Direct:
         else:
             kind, body = _ANSWERED, b"" if len(answer) > link.MOST_DIRECT else answer
         key = self._wire.keys.answers(asked.session)
-        put = partial(
-            self._wire.raw.put,
-            key,
-            body,
-            attachment=b"%s%d" % (kind, asked.number),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_HIGH,
-            express=True,
-        )
-        link.quietly(put, key)
+        # The asking side may be gone, or this one closing: that is for whoever asks to find out.
+        with contextlib.suppress(zenoh.ZError):
+            self._wire.raw.put(
+                key,
+                body,
+                attachment=b"%s%d" % (kind, asked.number),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_HIGH,
+                express=True,
+            )
 
 
 def _read(attached: bytes) -> Asked | None:
