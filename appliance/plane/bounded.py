@@ -144,8 +144,11 @@ class BoundedMembership(Membership):
                 async with asyncio.timeout_at(self._upkeep.next_at):
                     await self._sooner.wait()
                     continue
+            began = self._now()
             try:
                 await self._round()
+                now = self._now()
+                self._upkeep.took(now - began, now)
             except Exception:  # supervision boundary: the ring must be kept up whatever one round ran into
                 log.exception("a round of the ring failed")
 
@@ -154,8 +157,10 @@ class BoundedMembership(Membership):
             case Meet(member):
                 try:
                     told = await self._rpc.call(member, "ring_meet", MeetAsk(self._me), Around, timeout_s=_ASK_S)
-                except (UnreachableError, DeadlineError):
+                except UnreachableError:
                     self._upkeep.unreachable(member, self._now())
+                except DeadlineError:
+                    self._upkeep.late(member, self._now())
                 except SwiftbotError as error:
                     log.warning("a member does not meet", member=member, reason=str(error))
                 else:
@@ -174,9 +179,12 @@ class BoundedMembership(Membership):
             ask = NextAsk(f"{target:040x}", named=lookup.named(name))
             try:
                 step = await self._rpc.call(name, "ring_next", ask, Step, timeout_s=_ASK_S)
-            except (UnreachableError, DeadlineError):
+            except UnreachableError:
                 lookup.failed(name)
                 self._upkeep.unreachable(name, self._now(), in_round=False)
+            except DeadlineError:
+                lookup.failed(name)
+                self._upkeep.late(name, self._now(), in_round=False)
             except (RefusedError, PayloadError):
                 lookup.failed(name)
             else:

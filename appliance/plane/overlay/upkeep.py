@@ -27,6 +27,11 @@ _MOST_GONE = 1024
 _MOST_FIRST = 32
 _TRUST_S = 5.0
 """How long a member that was heard from is not suspected."""
+_PATIENCE = 3
+"""Questions in a row that a member whose token is seen may leave without an answer before it counts as gone."""
+_BREATH = 4.0
+"""The next round comes no sooner than after so many times what the last one took: where all are slow because there is
+more to do than they can, they do less."""
 
 
 class MeetAsk(Struct, frozen=True, omit_defaults=True):
@@ -78,6 +83,8 @@ class Upkeep:
         self.next_at = now + rng.uniform(0, self.interval_s)
         self._seen: dict[str, float] = dict.fromkeys(view.names, now)
         self._gone: dict[str, float] = {}
+        self._late: dict[str, int] = {}
+        """Member -> questions in a row that it has not answered in time."""
         self._newest: list[str] = []
         self._turn = 0
         self._first: list[str] = []
@@ -130,6 +137,7 @@ class Upkeep:
     def met(self, member: str, told: Around, now: float) -> None:
         """The member met has answered."""
         self._seen[member] = now
+        self._late.pop(member, None)
         self._gone.pop(member, None)
         # One that was heard from a moment ago is there, only its neighbour does not know it yet.
         suspects = [name for name in self.view.unlisted(member, told) if now - self._seen.get(name, 0.0) > _TRUST_S]
@@ -139,10 +147,25 @@ class Upkeep:
         self.view.hear(usable.others)
         self._changed(self._news(new) or bool(suspects))
 
+    def took(self, seconds: float, now: float) -> None:
+        """So long a round has taken."""
+        self.next_at = max(self.next_at, now + min(self._pace.most_s, seconds * _BREATH))
+
+    def late(self, member: str, now: float, *, in_round: bool = True) -> None:
+        """A member has not answered in time, in a round or a lookup; that it is gone its token would tell."""
+        count = self._late.get(member, 0) + 1
+        if count >= _PATIENCE or member not in self.view:
+            self.unreachable(member, now, in_round=in_round)
+            return
+        self._late[member] = count
+        # Not the one to be met next again.
+        self._seen[member] = now
+
     def unreachable(self, member: str, now: float, *, in_round: bool = True) -> None:
         """A member is not there: found so in a round, by a lookup, or told by whoever watches for it."""
         known = self.view.lose(member)
         self._seen.pop(member, None)
+        self._late.pop(member, None)
         if len(self._gone) >= _MOST_GONE:
             del self._gone[next(iter(self._gone))]
         self._gone.setdefault(member, now)
@@ -211,6 +234,7 @@ class Upkeep:
         view.trim(self._rng)
         if len(self._seen) > 2 * view.bound:
             self._seen = {name: at for name, at in self._seen.items() if name in view}
+            self._late = {name: count for name, count in self._late.items() if name in view}
         most = view.before_count
         near = set(view.names) if view.whole else {*view.after()[:most], *view.before()[-most:]}
         news = [name for name in new if name in near]

@@ -180,3 +180,40 @@ def test_two_halves_that_lost_each_other_grow_together() -> None:
     fleet.rounds(200)
     check_neighbours(fleet)
     check_closed(fleet)
+
+
+def test_who_is_late_once_is_not_gone() -> None:
+    """A member is dropped for questions that it left unanswered in a row, not for one; an answer in between counts."""
+    fleet = Fleet(bound=16, seed=3).settled(f"gw-{n}" for n in range(12))
+    upkeep = fleet.members[fleet.any()]
+    member = upkeep.view.names[2]
+    interval_s = upkeep.interval_s
+    for _ in range(5):
+        upkeep.late(member, fleet.now)
+        upkeep.late(member, fleet.now, in_round=False)
+        assert member in upkeep.view
+        upkeep.met(member, fleet.members[member].asked(MeetAsk(upkeep.view.me), fleet.now), fleet.now)
+    assert upkeep.interval_s >= interval_s
+    for _ in range(3):
+        assert member in upkeep.view
+        upkeep.late(member, fleet.now)
+    assert member not in upkeep.view
+    upkeep.late("nobody", fleet.now)
+    assert "nobody" not in upkeep.view
+
+
+def test_rounds_that_take_long_come_seldom() -> None:
+    """Where a round takes half a second the next comes after two at the soonest, and never later than it may."""
+    fleet = Fleet(bound=16, seed=4).settled(f"gw-{n}" for n in range(12))
+    upkeep = fleet.members[fleet.any()]
+    upkeep.unreachable(upkeep.view.names[1], 100.0)
+    for _ in range(20):
+        upkeep._changed(True)
+    upkeep.due(100.0)
+    assert upkeep.next_at < 101.0
+    upkeep.took(0.001, 100.0)
+    assert upkeep.next_at < 101.0
+    upkeep.took(0.5, 100.5)
+    assert upkeep.next_at == 102.5
+    upkeep.took(60.0, 160.0)
+    assert upkeep.next_at == 170.0
