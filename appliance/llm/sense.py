@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 
+from appliance.llm.language.plurals import singular
 from appliance.llm.validate import JOINT
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue, SkillManifest
@@ -96,13 +97,7 @@ def stems(text: str) -> frozenset[str]:
 
 def stem(word: str) -> str:
     """Return a word without an ending of the plural, to compare with others so treated."""
-    if word.endswith("ies") and len(word) > 4:
-        return word[:-3] + "y"
-    if word.endswith("ves") and len(word) > 4:
-        return word[:-3] + "f"
-    if word.endswith(("ches", "shes", "xes", "sses", "oes")):
-        return word[:-2]
-    return word[:-1] if word.endswith("s") and len(word) > 3 and not word.endswith("ss") else word
+    return singular(word) if len(word) > 3 else word
 
 
 def before(subtasks: Sequence[Subtask]) -> dict[str, frozenset[str]]:

@@ -10,8 +10,8 @@
 
 Subtasks have the numbers 1, 2, … in the order they stand in, and come after those whose numbers follow "<". The name
 of a parameter says what a text is: a name, a free text, a quantity or a robot (`values`). `read` of what `write` wrote
-is the same plan, for every plan of the catalogue; `write` chooses the shortest, then the first run of words that means
-a value.
+is the same plan, for every plan of the catalogue; `write` chooses the shortest, then the first run of the instruction's
+words that means a value, and a word of the roster only if there is none: whoever is named is copied from where he is.
 """
 
 import json
@@ -24,6 +24,7 @@ from msgspec import Struct
 
 from appliance.errors import PlanError
 from appliance.llm.language import values
+from appliance.llm.language.plurals import singular
 from appliance.llm.language.words import Words
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
@@ -44,19 +45,6 @@ class Answer(Struct, frozen=True, kw_only=True):
     domain: str = ""
     subtasks: tuple[Subtask, ...] = ()
     refused: str = ""
-
-
-def singular(text: str) -> str:
-    """Return a name with its last word in the singular, and without the 's of its owner."""
-    if text.endswith("'s"):
-        return text[:-2]
-    if text.endswith("ies") and len(text) > 4:
-        return text[:-3] + "y"
-    if text.endswith("ves") and len(text) > 4:
-        return text[:-3] + "f"
-    if text.endswith(("ches", "shes", "xes", "sses", "oes")):
-        return text[:-2]
-    return text[:-1] if text.endswith("s") and not text.endswith("ss") else text
 
 
 # --- writing ----------------------------------------------------------------------------------------------------
@@ -168,12 +156,13 @@ class _Writer:
         return [*found, "~"] if found else []
 
     def _runs(self, longest: int) -> Iterator[tuple[int, int]]:
-        """Yield runs of words, the shortest first, those of the instruction before those of the roster."""
-        count = len(self._words)
+        """Yield the runs of the instruction's words, the shortest first, and after them the words of the roster."""
+        own = self._words.own
         for length in range(longest):
-            for first in range(count - length):
-                if first + length < self._words.own or length == 0:
-                    yield first, first + length
+            for first in range(own - length):
+                yield first, first + length
+        for word in range(own, len(self._words)):
+            yield word, word
 
 
 def _pointed(first: int, last: int) -> list[str]:

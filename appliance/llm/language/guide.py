@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from msgspec import Struct
 
 from appliance.llm.language import values
-from appliance.llm.language.codec import JOINT, OPERATOR, has_robot, is_number, singular
+from appliance.llm.language.codec import JOINT, OPERATOR, has_robot, is_number
+from appliance.llm.language.plurals import singular
 from appliance.llm.language.words import Words
 from appliance.skills.catalogue import Catalogue
 

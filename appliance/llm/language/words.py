@@ -3,6 +3,9 @@
 A word is a run of letters and digits with what may stand inside a name ("robot_1", "crow's", "a.wav", "B-12", "10:42");
 every other mark is a word of its own, blanks are none. Words keep where they stand, so that a run of them is again the
 text as it was written. The robots of the roster follow as words after the instruction's own.
+
+Lines of a list are read as one sentence: what stands before an item ("2.", "b)", "-") is no figure of the order before
+it, and the end of a line parts as a mark does.
 """
 
 import re
@@ -12,6 +15,13 @@ from msgspec import Struct
 
 MAX_WORDS = 256
 """Words of an instruction and its roster; a longer one is for another planner."""
+_ITEM = re.compile(r"(?:\(?(?:\d{1,2}|[a-z])[.)](?=\s)|\d{1,2}:(?=\s)|[-–—*•·](?=\s))\s*", re.IGNORECASE)
+"""What stands before an item of a list."""
+_BY_NUMBER = re.compile(
+    r"\b(?:step|item|point|line|number|after|once|until|before|with|and)s?\s+#?\d{1,2}\b(?!\s*(?:\w|°|%))",
+    re.IGNORECASE,
+)
+"""An item spoken of by its number ("after 1", "step 2 is done")."""
 _WORD = re.compile(r"\w+(?:[_.'’:/-]\w+)*|[^\w\s]")
 
 
@@ -37,10 +47,35 @@ class Words(Struct, frozen=True):
 
 def words_of(instruction: str, robots: Sequence[str] = ()) -> Words:
     """Cut an instruction into words and append a roster, one word for each robot."""
-    spans = [match.span() for match in _WORD.finditer(instruction)]
-    own, text = len(spans), instruction
+    text = in_one_line(instruction)
+    spans = [match.span() for match in _WORD.finditer(text)]
+    own = len(spans)
     for robot in robots:
         text += "\n"
         spans.append((len(text), len(text) + len(robot)))
         text += robot
     return Words(text, tuple(spans), own)
+
+
+def in_one_line(instruction: str) -> str:
+    """Return an instruction of several lines as one sentence; any other as it is.
+
+    The numbers of items go, unless an item is spoken of by its number. A line that heads a list ends in a colon.
+    """
+    lines = [line.strip() for line in instruction.splitlines() if line.strip()]
+    if len(lines) < 2:
+        return instruction
+    items = [_ITEM.match(line) for line in lines]
+    numbered = _BY_NUMBER.search(
+        " ".join(line[item.end() :] if item else line for line, item in zip(lines, items, strict=True))
+    )
+    made = ""
+    for number, (line, item) in enumerate(zip(lines, items, strict=True)):
+        said = line if item is None or numbered else line[item.end() :]
+        made += said
+        if number + 1 < len(lines):
+            heads = item is None and items[number + 1] is not None
+            ended = said.endswith((".", ",", ";", ":", "!", "?", "–", "—", "-", "…"))
+            goes_on = re.match(r"(?:and|then|or|but)\b", lines[number + 1], re.IGNORECASE)
+            made += " " if ended else ": " if heads else ", " if goes_on else "; "
+    return made

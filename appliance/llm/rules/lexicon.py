@@ -7,6 +7,8 @@ without articles and possessives, numbers in the unit that the parameter's name 
 import re
 from functools import lru_cache
 
+from appliance.llm.language.plurals import singular
+
 _ARTICLE = r"(?:the|a|an|its|his|her|their|your|my|our|some|any)"
 _IRREGULAR = {
     "go": "goes going gone went",
@@ -255,17 +257,6 @@ def noun(text: str) -> str:
     text = re.sub(rf"\b{_ARTICLE}\s+", "", text, flags=re.IGNORECASE)
     text = re.sub(r"(\w)['\u2019]s\b", r"\1", text)
     return " ".join(text.lower().split())
-
-
-def singular(word: str) -> str:
-    """Return the singular of a regular plural."""
-    if word.endswith("ies"):
-        return word[:-3] + "y"
-    if word.endswith(("shelves", "halves")):
-        return word[:-3] + "f"
-    if word.endswith(("ches", "shes", "xes", "sses")):
-        return word[:-2]
-    return word[:-1] if word.endswith("s") and not word.endswith("ss") else word
 
 
 def things(text: str) -> list[str]:

@@ -8,7 +8,7 @@ tells more than a plan for another robot would.
 import re
 from collections.abc import Sequence
 
-from appliance.llm.rules import lexicon as lx
+from appliance.llm.language.plurals import singular
 
 KIND = (
     r"(?:robots?|drones?|rovers?|arms?|uavs?|ugvs?|bots?|carts?|vehicles?|quadcopters?|copters?|"
@@ -203,7 +203,7 @@ class Names:
         """Return the robots of a kind ("drones"); `["all"]` when the roster is unknown."""
         if self.roster is None:
             return ["all"]
-        word = lx.singular(kind.lower().strip()) if kind else ""
+        word = singular(kind.lower().strip()) if kind else ""
         if not word or word in _GENERIC or word == "them":
             return list(self.roster)
         named = [name for name in self.roster if name.startswith(word) or name.endswith(word)]

@@ -5,6 +5,7 @@ Quoted texts are taken out first, so that no comma in a message looks like the e
 
 import re
 
+from appliance.llm.language.plurals import singular
 from appliance.llm.rules import lexicon as lx
 from appliance.model import Subtask
 
@@ -151,7 +152,7 @@ def spread(match: re.Match[str]) -> str:
     """Write "goals 1, 2 and 3" as "goal 1, goal 2 and goal 3"."""
     head = match[1]
     items = re.findall(r"\d+|\b[A-Z]\b", match[2])
-    named = [f"{lx.singular(head + 's')} {item}" for item in items]
+    named = [f"{singular(head + 's')} {item}" for item in items]
     return ", ".join(named[:-1]) + " and " + named[-1]
 
 
