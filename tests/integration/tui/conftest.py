@@ -5,6 +5,7 @@ import importlib.util
 import io
 import tarfile
 import textwrap
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
@@ -12,12 +13,17 @@ import pytest
 from fleets import fleet_in
 from moving_bench import write_skills
 
+from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.llm.settings import LlmConfig
 from appliance.local_fleet import FleetState
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
+from appliance.tui.actions import BY_NAME
+
+from .operating import AUDITED, LONG_S, WATCHED, Operator, operator
+from .ordering import is_told
 
 LAME = "lame"
 """An image that the fleet knows and that does not exist until a test makes it."""
@@ -97,3 +103,43 @@ def toy(project_root: Path, tmp_path: Path) -> Path:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.build(tmp_path / "toy")
+
+
+@pytest.fixture
+async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
+    """Return somebody else's eyes on the fleet."""
+    async with FleetClient(fleet.endpoint, operator="eve") as made:
+        yield made
+
+
+@pytest.fixture
+async def watched(request: pytest.FixtureRequest, client: FleetClient) -> AsyncIterator[None]:
+    """Hold a test to what it says it `does`: each action was done, and stands in the audit with who and why."""
+    began_ns = time.time_ns()
+    WATCHED.clear()
+    yield
+    wanted = getattr(request.function, "does", ())
+    begun = {each for app in WATCHED for each in app.begun}
+    done = {each for app in WATCHED for each in app.done}
+    for name in wanted:
+        assert name in (done if BY_NAME[name].do is not None else {action for action, _ in begun}), name
+    names = {app.view.operator for app in WATCHED}
+    verbs = {AUDITED[name] for name in wanted if name in AUDITED}
+    whys = {(AUDITED[name], why) for name, why in begun if name in wanted and why}
+    told: set[tuple[str, str]] = set()
+    try:
+        # What an order does can be seen before the gateway that it was given to has put it down.
+        async with asyncio.timeout(LONG_S):
+            while not (verbs <= {verb for verb, _ in told} and all(is_told(each, told) for each in whys)):
+                acts, _ = await client.acts(500)
+                told = {(each.verb, each.why) for each in acts if each.by in names and each.at_ns >= began_ns
+                        and each.outcome == "done"}  # fmt: skip
+    except TimeoutError:
+        pytest.fail(f"the audit has {told}, and should have {verbs}, {whys}")
+
+
+@pytest.fixture
+async def ann(fleet: FleetState) -> AsyncIterator[Operator]:
+    """Return an operator at a terminal UI on it."""
+    async with operator(fleet, "ann") as it:
+        yield it
