@@ -310,7 +310,7 @@ class Simulation:
         took_ms = (self._now - since) * 1e3
         if container.for_run:
             self._counts["cold"] += 1
-            self._cold_ms += took_ms
+            self._cold_ms += container.cold_ms  # without the wait for room before it
         else:
             self._counts["local"] += 1
             self._counts["sooner"] += 1

@@ -66,6 +66,10 @@ def test_runs_wait_when_everything_is_busy() -> None:
     outcome = simulate(trace_of((0.0, "a"), (0.1, "a")), replace(BARE, memory_mb=1024))
     assert (outcome.cold, outcome.local, outcome.waited, outcome.lost) == (1, 1, 1, 0)
     assert outcome.p99_ms == 1400.0 + WARM_MS
+    # One of another image waits for room and is started then: its wait is its own, its cold start is half a second.
+    other = simulate(trace_of((0.0, "a"), (0.1, "b")), replace(BARE, memory_mb=1024))
+    assert (other.cold, other.cold_s, other.waited) == (2, 1.0, 1)
+    assert other.p99_ms == 1400.0 + 500.0
 
 
 def test_a_run_takes_what_comes_free_before_its_own() -> None:
