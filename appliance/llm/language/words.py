@@ -18,7 +18,8 @@ MAX_WORDS = 256
 _ITEM = re.compile(r"(?:\(?(?:\d{1,2}|[a-z])[.)](?=\s)|\d{1,2}:(?=\s)|[-–—*•·](?=\s))\s*", re.IGNORECASE)
 """What stands before an item of a list."""
 _BY_NUMBER = re.compile(
-    r"\b(?:step|item|point|line|number|after|once|until|before|with|and)s?\s+#?\d{1,2}\b(?!\s*(?:\w|°|%))",
+    r"\b(?:step|item|point|line|number|after|once|until|before|with|and)s?\s+#?\d{1,2}\b"
+    r"(?=\s*(?:$|[,;:)!]|[.](?!\d)|(?:is|are|has|have|was|and|or)\b))",
     re.IGNORECASE,
 )
 """An item spoken of by its number ("after 1", "step 2 is done")."""
