@@ -8,6 +8,7 @@ JSON; times are those of the machine's monotonic clock, so that processes' times
 import asyncio
 import gc
 import json
+import math
 import os
 import random
 import resource
@@ -129,9 +130,14 @@ class Host:
             await asyncio.sleep(STATUS_S)
 
     async def _settled(self, ask: dict[str, Any]) -> dict[str, float]:
-        """Wait until every member here knows all the others it should, and has reconciled; answers since when."""
-        wanted = int(ask["members"])
+        """Wait until every member here knows all the others it should, and has reconciled; answers since when.
+
+        A bounded view goes on taking better members for those it has, for minutes after the last has come: where
+        `behind_s` is given a member may be so long behind with the facts and records of those it has just met.
+        """
+        wanted, behind_s = int(ask["members"]), float(ask.get("behind_s", 0.0))
         since: dict[str, float] = {}
+        last: dict[str, float] = {}
         while True:
             now = time.monotonic()
             for name, plane in self._planes.items():
@@ -139,7 +145,8 @@ class Host:
                 known = len(members) >= wanted and members <= plane.registry.gateways.keys()
                 if known and plane.dht.reconciled():
                     since.setdefault(name, now)
-                else:
+                    last[name] = now
+                elif now - last.get(name, -math.inf) > behind_s:
                     since.pop(name, None)
             if len(since) == len(self._planes):
                 return since

@@ -32,6 +32,8 @@ Progress = Callable[[str], None]
 PATIENCE_S = 300.0
 """For one step of all members: opening them takes longest."""
 END_S = 10.0
+_BEHIND_S = 2.0
+"""How long a member with a bounded view may be behind with what those tell whom it has just met."""
 
 
 class Options(Struct, frozen=True, kw_only=True):
@@ -196,7 +198,7 @@ class Fleet:
         opened = time.monotonic()
         self._progress(f"all are open after {opened - began:.1f} s, now they get to know each other")
         wanted = options.members if not bound else min(options.members, bound // 2)
-        await self._all("settled", members=wanted)
+        await self._all("settled", members=wanted, behind_s=_BEHIND_S if bound else 0.0)
         result["open_s"], result["all_know_all_s"] = round(opened - began, 2), round(time.monotonic() - began, 2)
         self._progress(f"all know all after {result['all_know_all_s']} s; idle for {options.idle_s:g} s")
         result |= await self._idle(empty_mb)
