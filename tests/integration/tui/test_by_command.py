@@ -114,12 +114,12 @@ async def test_plans(cora: Shell, client: FleetClient, tmp_path: Path) -> None:
     wrong.write_text(json.dumps(plan | {"subtasks": [there]}))
     assert (await cora("task", "check", str(wrong), "--task", "c-plan", code=4))["problems"]
     assert not (await cora("task", "check", str(shorter), "--task", "c-plan"))["problems"]
-    await cora("task", "approve", "c-plan", "--hash", "0" * 12, code=1)
+    await cora("task", "approve", "c-plan", "--hash", "0" * 12, code=4)
     approved = await cora(
         "task", "approve", "c-plan", "--hash", waiting, "--plan", str(shorter), "--why", "dock 2 is closed"
     )
     assert (approved["decision"]["by"], approved["decision"]["edited"]) == ("cora", True)
-    assert "cora has approved" in await cora("task", "approve", "c-plan", "--hash", waiting, code=1)
+    assert "cora has approved" in await cora("task", "approve", "c-plan", "--hash", waiting, code=4)
     record = await until(client, "c-plan", lambda record: record.state.final)
     assert [each.subtask.id for each in record.subtasks] == ["s1"]
     await client.submit(TaskRequest(instruction="rover_2: go to dock 1", id="c-no", approval=Approval.ALWAYS))
@@ -138,7 +138,7 @@ async def test_robots(cora: Shell, client: FleetClient) -> None:
     assert (stop["robots"], stop["by"]) == (["rover_1"], "cora")
     assert not (await cora("resume", "rover_1", "--why", "gone")).get("stops")
     lease = (await cora("robots", "take", "rover_1", "--lease", "60", "--why", "to look"))["id"]
-    assert "taken over by cora" in await cora("robots", "take", "rover_1", code=1)
+    assert "taken over by cora" in await cora("robots", "take", "rover_1", code=4)
     assert "pose" in await cora("robots", "move", "rover_1", "--lease", lease, "--forward", "0.3", "--for", "0.3")
     assert (await cora("robots", "renew", "rover_1", "--lease", lease))["robot"] == "rover_1"
     assert (await cora("robots", "give", "rover_1", "--lease", lease, "--why", "seen"))["ended"]
