@@ -26,6 +26,8 @@ GROUP = 16
 """Batches of a group, about."""
 SHIFTED = 0.25
 """Share of examples whose words are not numbered from 0."""
+ONCE = 0.05
+"""Share of examples that are read once where the others are read twice: as one is that has no room for more."""
 
 Batch = tuple[Tensor, Tensor]
 """Tokens and, in the same place, labels: those of the answers, IGNORED everywhere else."""
@@ -40,16 +42,25 @@ class Groups(Dataset[list[Batch]]):
         seed: of all that is random.
         batch_tokens: of a batch at most, padding counted.
         original: share of examples as they were written, without variation.
+        twice: whether instructions are read twice.
     """
 
     def __init__(
-        self, examples: Sequence[Example], tokens: Tokens, *, seed: int, batch_tokens: int, original: float
+        self,
+        examples: Sequence[Example],
+        tokens: Tokens,
+        *,
+        seed: int,
+        batch_tokens: int,
+        original: float,
+        twice: bool = False,
     ) -> None:
         self._examples = examples
         self._tokens = tokens
         self._seed = seed
         self._batch_tokens = batch_tokens
         self._original = original
+        self._twice = twice
         self._lexicon = Lexicon(examples)
 
     def __getitem__(self, number: int) -> list[Batch]:
@@ -62,7 +73,8 @@ class Groups(Dataset[list[Batch]]):
                 example = vary(example, self._examples, self._lexicon, rng)
             # Words are numbered from 0 when it answers; from anywhere now and then, so that high numbers are learnt.
             shift = rng.randrange(MAX_WORDS + 1 - len(example.words)) if rng.random() < SHIFTED else 0
-            row = self._tokens.example(example, shift=shift)
+            twice = self._twice and rng.random() >= ONCE
+            row = self._tokens.example(example, shift=shift, twice=twice)
             if (length := len(row[0]) + len(row[1])) <= min(CONTEXT, self._batch_tokens):
                 rows.append(row)
                 total += length

@@ -250,6 +250,7 @@ class Trainer:
             seed=recipe.seed,
             batch_tokens=recipe.batch_tokens,
             original=recipe.original,
+            twice=recipe.twice,
         )
         # No group has fewer than one batch: there are always enough.
         order = range(self._group, self._group + recipe.steps + 1)
@@ -273,7 +274,9 @@ class Trainer:
         self._model.eval()
         figures: dict[str, Any] = {"step": self._step}
         for name, examples in self._held_out.items():
-            figures[name] = judge(self._model, self._tokens, examples[:most], self._catalogue)
+            figures[name] = judge(
+                self._model, self._tokens, examples[:most], self._catalogue, twice=self.recipe.twice
+            )
             self._progress(f"  {name}: {figures[name]}")
         self._model.train()
         with (
@@ -299,7 +302,11 @@ def main(arguments: Sequence[str]) -> int:
     )
     for each in fields(Recipe):
         kind = type(each.default)
-        parser.add_argument(f"--{each.name.replace('_', '-')}", type=kind, help=f"by default {each.default}")
+        flag, told = f"--{each.name.replace('_', '-')}", f"by default {each.default}"
+        if kind is bool:
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=None, help=told)
+        else:
+            parser.add_argument(flag, type=kind, help=told)
     parser.add_argument(
         "--base", help="a run, a model folder or `embedded`: begin with its weights, and as large (not to go on)"
     )

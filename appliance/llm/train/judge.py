@@ -48,11 +48,13 @@ def answers(model: Any, tokens: Tokens, prompts: Sequence[list[int]], *, batch: 
     return found
 
 
-def judge(model: Any, tokens: Tokens, examples: Sequence[Example], catalogue: Catalogue) -> dict[str, Any]:
+def judge(
+    model: Any, tokens: Tokens, examples: Sequence[Example], catalogue: Catalogue, *, twice: bool = False
+) -> dict[str, Any]:
     """Return percent by figure over examples, refusals counted apart (`refused`: answered alike)."""
     rows: list[Score] = []
     refused: list[bool] = []
-    said = answers(model, tokens, [tokens.prompt(each.words, each.own) for each in examples])
+    said = answers(model, tokens, [tokens.prompt(each.words, each.own, twice=twice) for each in examples])
     for example, answer in zip(examples, said, strict=True):
         words = words_of(" ".join(example.words[: example.own]), example.words[example.own :])
         symbols = tokens.symbols(answer)

@@ -47,6 +47,8 @@ class Recipe:
     """Share of examples as they were written, without variation."""
     dropout: float = 0.0
     """Share of what a layer adds, and of a token's embedding, that is left out of a step, anew each time."""
+    twice: bool = False
+    """Whether an instruction is read twice before it is answered (`tokens`)."""
 
 
 def new_model(recipe: Recipe, tokens: Tokens) -> LlamaForCausalLM:

@@ -2,6 +2,9 @@
 
     <w3> rex <w4> , <w5> fetch … <roster> <w20> max … <plan> manipulation goto <w3> <w3> place: … <end>
 
+Where the instruction is read twice, it stands before that once more, without numbers: <begin> rex , fetch … <begin>. A
+Llama model sees only what is before a word; so it sees all of the instruction at each numbered one.
+
 Every symbol of the language is one token. Words are cut into pieces learnt from the corpus, down to single bytes, so no
 name is unknown. Numbers of words may begin anywhere (`shift`): in training at random, so that all are learnt alike.
 """
@@ -91,9 +94,11 @@ class Tokens:
         """Return the number of a frame token, or of a symbol written in angle brackets."""
         return self._id[token]
 
-    def prompt(self, words: Sequence[str], own: int, *, shift: int = 0) -> list[int]:
-        """Return the tokens up to and with <plan>."""
+    def prompt(self, words: Sequence[str], own: int, *, shift: int = 0, twice: bool = False) -> list[int]:
+        """Return the tokens up to and with <plan>; `twice`: with the instruction once more in front."""
         found = [self._id[BEGIN]]
+        if twice:
+            found += [piece for word in words[:own] for piece in self._cut(word.lower())] + [self._id[BEGIN]]
         for number, word in enumerate(words):
             if number == own:
                 found.append(self._id[ROSTER])
@@ -116,9 +121,10 @@ class Tokens:
                 found += [self._id[LITERAL], *self._cut(quoted + text), self._id[LITERAL]]
         return [*found, self._id[END]]
 
-    def example(self, example: Example, *, shift: int = 0) -> tuple[list[int], list[int]]:
+    def example(self, example: Example, *, shift: int = 0, twice: bool = False) -> tuple[list[int], list[int]]:
         """Return the tokens of the prompt and of the answer of an example."""
-        return self.prompt(example.words, example.own, shift=shift), self.answer(example.symbols, shift=shift)
+        prompt = self.prompt(example.words, example.own, shift=shift, twice=twice)
+        return prompt, self.answer(example.symbols, shift=shift)
 
     def symbols(self, tokens: Iterable[int], *, shift: int = 0) -> list[str]:
         """Return the symbols of an answer's tokens; what is no symbol stands as it is, to be refused by the reader."""
