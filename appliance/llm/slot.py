@@ -27,7 +27,8 @@ import msgspec
 from appliance.llm import frames
 from appliance.llm.embedded import remedy_of
 from appliance.llm.language.evidence import read_evidence
-from appliance.llm.speaking import BrokenOffError, Question, Speaker, TooLateError, TooLongError, read_card
+from appliance.llm.speaking import BrokenOffError, Card, Question, Speaker, TooLateError, read_card
+from appliance.llm.voices import TooLongError, Voice, Voices
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -62,28 +63,28 @@ def check_folder(folder: Path) -> None:
             raise SlotError("prerequisite", f"model folder {folder} has no {name}", remedy)
 
 
-class Slot:
-    """One loaded model."""
+class _Loaded:
+    """A model of the library, with its tokenizer."""
 
-    def __init__(self, folder: Path, *, threads: int = 0, max_tokens: int = 8192) -> None:
+    def __init__(self, folder: Path, threads: int) -> None:
         check_folder(folder)
         try:
-            config_text = json.loads((folder / "genai_config.json").read_text(encoding="utf-8"))
-            context = int(config_text["model"]["context_length"])
+            sizes = json.loads((folder / "genai_config.json").read_text(encoding="utf-8"))["model"]
+            self.context = int(sizes["context_length"])
+            self.vocabulary = int(sizes.get("vocab_size", 0))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SlotError(
                 "prerequisite", f"{folder}/genai_config.json is damaged: {error!r}", "copy the model folder again"
             ) from error
         # Untyped, and loading it takes 40 MB that only this process is to pay.
-        og: Any = importlib.import_module("onnxruntime_genai")
-        self._og = og
+        self.og: Any = importlib.import_module("onnxruntime_genai")
         try:
-            config = og.Config(str(folder))
+            config = self.og.Config(str(folder))
             if threads:
                 options = {"model": {"decoder": {"session_options": {"intra_op_num_threads": threads}}}}
                 config.overlay(json.dumps(options))
-            self._model = og.Model(config)
-            self._tokenizer = og.Tokenizer(self._model)
+            self.model = self.og.Model(config)
+            self.tokenizer = self.og.Tokenizer(self.model)
         except Exception as error:
             # The library raises bare RuntimeErrors for whatever is wrong with the files.
             raise SlotError(
@@ -91,25 +92,44 @@ class Slot:
                 f"model folder {folder} cannot be loaded: {str(error)[:300]}",
                 "copy the folder again; it must be made for onnxruntime-genai",
             ) from error
-        try:
-            card = read_card(folder)
-            evidence = None if card is None else read_evidence(folder)
-        except (ValueError, OSError) as error:
-            raise SlotError(
-                "prerequisite", str(error), "copy the model folder again, readable for the gateway"
-            ) from error
-        self.speaker = (
-            None
-            if card is None
-            else Speaker(og, self._model, self._tokenizer, card, context=context, evidence=evidence)
-        )
+
+    def voice(self, card: Card) -> Voice:
+        """Return it as one of a planner's models."""
+        return Voice(self.og, self.model, self.tokenizer, card.tokens, twice=card.twice, context=self.context)
+
+
+def _speaker(folder: Path, loaded: _Loaded, threads: int) -> Speaker | None:
+    """Return the planner of a folder, with the models beside its own; None where it speaks no plan language."""
+    again = "copy the model folder again, readable for the gateway"
+    try:
+        card = read_card(folder)
+        if card is None:
+            return None
+        voices = [loaded.voice(card)]
+        for name in card.beside:
+            other = read_card(folder / name)
+            if other is None or other.tokens != card.tokens:
+                raise SlotError("prerequisite", f"{folder / name} has not the tokens of {folder}", again)
+            voices.append(_Loaded(folder / name, threads).voice(other))
+        return Speaker(Voices(voices), card, evidence=read_evidence(folder))
+    except (ValueError, OSError) as error:
+        raise SlotError("prerequisite", str(error), again) from error
+
+
+class Slot:
+    """One loaded model."""
+
+    def __init__(self, folder: Path, *, threads: int = 0, max_tokens: int = 8192) -> None:
+        loaded = _Loaded(folder, threads)
+        self._og, self._model, self._tokenizer = loaded.og, loaded.model, loaded.tokenizer
+        self.speaker = _speaker(folder, loaded, threads)
         """For a model that writes the plan language; others are asked in JSON under a grammar."""
-        self._limit = min(max_tokens, context)
+        self._limit = min(max_tokens, loaded.context)
         self._generator: Any = None
         self._key = ""
         self._seen: list[int] = []
         self._pieces: dict[str, list[int]] = {}
-        self._vocabulary = int(config_text["model"].get("vocab_size", 0))
+        self._vocabulary = loaded.vocabulary
 
     def say(self, question: dict[str, Any], stop: "Callable[[], bool]" = lambda: False) -> dict[str, Any]:
         """Answer an instruction in the plan language; `question` is a `Question`, the answer a `Said`."""

@@ -12,11 +12,11 @@ a confidence; it may have `evidence.bin`.
 import heapq
 import itertools
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from msgspec import Struct
@@ -24,7 +24,8 @@ from msgspec import Struct
 from appliance.llm.language.coverage import covered
 from appliance.llm.language.evidence import Evidence, skills_of, support
 from appliance.llm.language.guide import END, Guide, SkillShape
-from appliance.llm.language.words import MAX_WORDS, words_of
+from appliance.llm.language.words import words_of
+from appliance.llm.voices import TooLongError, Voices
 
 CARD = "planner.json"
 MOST_SYMBOLS = 600
@@ -41,6 +42,7 @@ LONGER, THOROUGH_LONGER = 3, 8
 """Times the symbols of the first answer that the others may have together."""
 FAIR, THOROUGH_FAIR = 0.06, 0.02
 """Share of a symbol from which on it is worth an answer of its own."""
+_INSIDE = re.compile(r"[\w-]+")
 
 
 class Card(Struct, frozen=True, kw_only=True):
@@ -52,6 +54,10 @@ class Card(Struct, frozen=True, kw_only=True):
     """Symbol, or frame token in angle brackets, to its token."""
     calibration: tuple[float, float] = (1.0, 0.0)
     """Slope and offset: the confidence is the logistic of slope x log-odds of the whole answer + offset."""
+    twice: bool = False
+    """Whether an instruction stands in the prompt twice, first without numbers; one that has no room for it, once."""
+    beside: tuple[str, ...] = ()
+    """Folders in this one whose models are asked too (`voices`); they have the same tokens."""
 
 
 class Question(Struct, frozen=True, kw_only=True):
@@ -106,10 +112,6 @@ class Spoken:
     turns: list[Turn] = field(default_factory=list[Turn])
 
 
-class TooLongError(Exception):
-    """The instruction has more words than the planner can number, or the answer does not end."""
-
-
 class TooLateError(Exception):
     """The answer did not end before its deadline."""
 
@@ -119,29 +121,19 @@ class BrokenOffError(Exception):
 
 
 class Speaker:
-    """One loaded model.
+    """A loaded planner.
 
     Args:
-        og: the library.
-        model: of the library.
-        tokenizer: of the library.
+        voices: its models.
         card: which token is which symbol.
-        context: tokens that prompt and answer may have.
         evidence: a second opinion on which skills an answer has; None where the folder has none.
     """
 
-    def __init__(
-        self, og: Any, model: Any, tokenizer: Any, card: Card, *, context: int, evidence: Evidence | None = None
-    ) -> None:
-        self._tokenizer = tokenizer
+    def __init__(self, voices: Voices, card: Card, *, evidence: Evidence | None = None) -> None:
+        self._voices = voices
         self._evidence = evidence
         self._card = card
-        self._context = context
         self._known = frozenset(card.tokens)
-        self._pieces: dict[str, list[int]] = {}
-        self._params = og.GeneratorParams(model)
-        self._params.set_search_options(max_length=context, do_sample=False)
-        self._new = lambda: og.Generator(model, self._params)
 
     def answer(self, question: Question, stop: Callable[[], bool] = lambda: False) -> Said:
         """Answer a question.
@@ -158,12 +150,10 @@ class Speaker:
         began = time.monotonic()
         words = words_of(question.text, question.robots or ())
         said_words = [words[number].lower() for number in range(len(words))]
-        prompt = self._prompt(said_words, words.own)
         odds = {} if self._evidence is None else self._evidence.odds(said_words[: words.own])
         odds = {skill: value for skill, value in odds.items() if skill in question.skills and skill in self._known}
         until = began + question.deadline_s
-        generator = self._new()
-        generator.append_tokens(prompt)
+        room = self._voices.begin(said_words, words.own)
 
         def guide() -> Guide:
             return Guide(words, question.skills, robots=question.robots, known=self._known)
@@ -174,9 +164,9 @@ class Speaker:
             if stop():
                 raise BrokenOffError("nobody waits for the answer any more")
 
-        most = min(MOST_SYMBOLS, self._context - len(prompt) - 2)
-        first = self._followed(generator, guide(), Spoken(), most, check)
-        paths, said = [first], first.tokens
+        most = min(MOST_SYMBOLS, room)
+        first = self._followed(guide(), Spoken(), most, check)
+        paths = [first]
         # An answer is there: what the others may take is bounded, by symbols, so that the same words get the same plan.
         until = began + MOST_OF * question.deadline_s
         turns_most, longer, fair = (
@@ -194,11 +184,10 @@ class Speaker:
             for symbol in trunk.symbols[: turn.at]:
                 other.take(symbol)
             begun = Spoken(symbols=trunk.symbols[: turn.at], tokens=trunk.tokens[: turn.at], cost=turn.cost)
-            _set_back(generator, len(prompt), said, begun.tokens)
-            said = begun.tokens
+            self._voices.say(begun.tokens)
             try:
-                if self._taken(generator, other, begun, turn.symbol, turn.token):
-                    self._followed(generator, other, begun, min(most, turn.at + left), check)
+                if self._taken(other, begun, turn.symbol, turn.token):
+                    self._followed(other, begun, min(most, turn.at + left), check)
                 paths.append(begun)
             except TooLongError:
                 pass
@@ -218,11 +207,11 @@ class Speaker:
             symbols=tuple(paths[0].symbols),
             others=tuple(Other(tuple(path.symbols), self._confidence(path.cost)) for path in paths[1:]),
             confidence=self._confidence(paths[0].cost),
-            tokens=len(prompt) + spoken,
+            tokens=self._voices.prompt + spoken,
             ms=round(1000 * (time.monotonic() - began), 3),
         )
 
-    def _followed(self, generator: Any, guide: Guide, path: "Spoken", most: int, check: Callable[[], None]) -> "Spoken":
+    def _followed(self, guide: Guide, path: "Spoken", most: int, check: Callable[[], None]) -> "Spoken":
         """Go on with an answer to its end, by the likeliest symbol each time."""
         while True:
             check()
@@ -231,8 +220,7 @@ class Speaker:
                 raise TooLongError(f"no end after {len(path.symbols)} symbols")
             best = 0
             if len(allowed) > 1:
-                logits = generator.get_logits().reshape(-1)
-                values = [float(logits[token]) for _, token in allowed]
+                values = self._voices.likely([token for _, token in allowed])
                 order = sorted(range(len(values)), key=values.__getitem__, reverse=True)
                 best, second = order[:2]
                 total = values[best] + math.log(sum(math.exp(value - values[best]) for value in values))
@@ -240,17 +228,17 @@ class Speaker:
                 against = total - values[second]
                 path.turns.append(Turn(len(path.symbols), symbol, token, path.cost + against, math.exp(-against)))
                 path.cost += total - values[best]
-            if not self._taken(generator, guide, path, *allowed[best]):
+            if not self._taken(guide, path, *allowed[best]):
                 return path
 
-    def _taken(self, generator: Any, guide: Guide, path: "Spoken", symbol: str, token: int) -> bool:
+    def _taken(self, guide: Guide, path: "Spoken", symbol: str, token: int) -> bool:
         """Take a symbol; whether the answer goes on."""
         guide.take(symbol)
         if guide.ended:
             return False
         path.symbols.append(symbol)
         path.tokens.append(token)
-        generator.append_tokens([token])
+        self._voices.go_on(token)
         return True
 
     def _confidence(self, against: float) -> float:
@@ -261,39 +249,6 @@ class Speaker:
 
     def _token(self, symbol: str) -> int | None:
         return self._card.tokens.get("<end>" if symbol == END else symbol)
-
-    def _prompt(self, words: list[str], own: int) -> list[int]:
-        tokens = self._card.tokens
-        if len(words) > MAX_WORDS:
-            raise TooLongError(f"{len(words)} words and robots, more than {MAX_WORDS}")
-        found = [tokens["<begin>"]]
-        for number, word in enumerate(words):
-            if number == own:
-                found.append(tokens["<roster>"])
-            found.append(tokens[f"w{number}"])
-            found += self._cut(word)
-        found.append(tokens["<plan>"])
-        if len(found) + 64 > self._context:
-            raise TooLongError(f"{len(found)} tokens, more than the planner's {self._context} leave room for")
-        return found
-
-    def _cut(self, word: str) -> list[int]:
-        pieces = self._pieces.get(word)
-        if pieces is None:
-            if len(self._pieces) > 20_000:
-                self._pieces.clear()
-            pieces = self._pieces[word] = [int(token) for token in self._tokenizer.encode(word)]
-        return pieces
-
-
-def _set_back(generator: Any, prompt: int, said: list[int], wanted: list[int]) -> None:
-    """Bring a generator from what it has said to what it is to have said; both count from the end of the prompt."""
-    same = 0
-    while same < min(len(said), len(wanted)) and said[same] == wanted[same]:
-        same += 1
-    generator.rewind_to(prompt + same)
-    if wanted[same:]:
-        generator.append_tokens(wanted[same:])
 
 
 def read_card(folder: Path) -> Card | None:
@@ -311,4 +266,6 @@ def read_card(folder: Path) -> Card | None:
         raise ValueError(f"{path} is damaged: {error}") from error
     if card.language != 1:
         raise ValueError(f"{path} is for version {card.language} of the plan language, not 1")
+    if any(not _INSIDE.fullmatch(each) for each in card.beside):
+        raise ValueError(f"{path} names a model that is not in its folder: {', '.join(card.beside)}")
     return card

@@ -12,12 +12,14 @@ from appliance.llm.train.tokens import BEGIN, END, PLAN, ROSTER, Tokens, symbols
 from appliance.skills.catalogue import Catalogue
 
 
-def card_of(tokens: Tokens, catalogue: Catalogue, *, calibration: tuple[float, float] = (1.0, 0.0)) -> Card:
-    """Return the card of a tokenizer."""
+def card_of(
+    tokens: Tokens, catalogue: Catalogue, *, calibration: tuple[float, float] = (1.0, 0.0), twice: bool = False
+) -> Card:
+    """Return the card of a tokenizer, and of a model that reads instructions twice or once."""
     found = {each: tokens.of(each) for each in (BEGIN, END, ROSTER, PLAN)}
     found |= {f"w{number}": tokens.of(f"<w{number}>") for number in range(MAX_WORDS)}
     found |= {symbol: tokens.of(f"<{symbol}>") for symbol in symbols_of(catalogue)}
-    return Card(language=1, tokens=found, calibration=calibration)
+    return Card(language=1, tokens=found, calibration=calibration, twice=twice)
 
 
 def write_card(folder: Path, card: Card) -> None:

@@ -69,17 +69,18 @@ def export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -
         command = [sys.executable, "-m", "onnxruntime_genai.models.builder", "-i", str(source), "-o", str(folder)]
         command += ["-p", precision, "-e", "cpu", "-c", f"{scratch}/cache"]
         subprocess.run([*command, *(["--extra_options", *options] if options else [])], check=True)
-    write_card(folder, card_of(tokens, catalogue))
+    recipe = json.loads((run / "recipe.json").read_text())
+    twice = bool(recipe.get("twice"))
+    write_card(folder, card_of(tokens, catalogue, twice=twice))
     parts = split(corpus_examples(catalogue))
     write_evidence(folder, learn(parts.train, catalogue))
     held_out = [*parts.structure, *parts.vocabulary, *parts.chance]
     held_out = held_out[:: max(1, len(held_out) // most)] if most else held_out
     slope, offset, curve = calibrate(folder, held_out, catalogue)
-    write_card(folder, card_of(tokens, catalogue, calibration=(slope, offset)))
+    write_card(folder, card_of(tokens, catalogue, calibration=(slope, offset), twice=twice))
     size = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
     kept = run / "figures.json"
     figures = json.loads(kept.read_text()) if kept.is_file() else {}
-    recipe = json.loads((run / "recipe.json").read_text())
     made = {"megabytes": round(size / 1e6, 1), "calibration": [slope, offset], "reliability": curve}
     (folder / "README.md").write_text(model_card(precision, recipe, figures, made, cases=len(held_out)))
     return made

@@ -274,9 +274,7 @@ class Trainer:
         self._model.eval()
         figures: dict[str, Any] = {"step": self._step}
         for name, examples in self._held_out.items():
-            figures[name] = judge(
-                self._model, self._tokens, examples[:most], self._catalogue, twice=self.recipe.twice
-            )
+            figures[name] = judge(self._model, self._tokens, examples[:most], self._catalogue, twice=self.recipe.twice)
             self._progress(f"  {name}: {figures[name]}")
         self._model.train()
         with (

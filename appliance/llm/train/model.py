@@ -16,6 +16,7 @@ from transformers import LlamaConfig, LlamaForCausalLM
 
 from appliance.errors import ConflictError, NotFoundError
 from appliance.llm.embedded import folder_of
+from appliance.llm.speaking import read_card
 from appliance.llm.train.batches import CONTEXT
 from appliance.llm.train.tokens import BEGIN, END, PAD, Tokens
 from appliance.llm.train.weights import is_model, read_weights
@@ -88,7 +89,8 @@ class Base:
             self.state = torch.load(self.folder / CHECKPOINT, map_location="cpu", weights_only=True)["model"]
         elif is_model(self.folder):
             shape, weights = read_weights(self.folder)
-            self.recipe = replace(self.recipe, **asdict(shape))
+            card = read_card(self.folder)
+            self.recipe = replace(self.recipe, **asdict(shape), twice=card is not None and card.twice)
             self.state = {key: torch.from_numpy(each.copy()) for key, each in weights.items()}
         else:
             raise NotFoundError(
