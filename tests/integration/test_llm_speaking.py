@@ -167,21 +167,6 @@ async def test_damaged_evidence_is_named(folder: Path, tmp_path: Path, damage: b
         await tier.close()
 
 
-def test_a_generator_that_was_set_back_says_the_same(folder: Path) -> None:
-    """The library's own promise, which another try rests on: after a rewind, as if the rest had never been said."""
-    speaker = Slot(folder).speaker
-    assert speaker is not None
-    prompt = speaker._prompt(["go", "home", "now"], 3)
-    fresh, again = speaker._new(), speaker._new()
-    fresh.append_tokens([*prompt, 5])
-    again.append_tokens(prompt)
-    again.append_tokens([7])
-    again.append_tokens([9])
-    again.rewind_to(len(prompt))
-    again.append_tokens([5])
-    assert abs(fresh.get_logits() - again.get_logits()).max() < 1e-4
-
-
 async def test_too_many_words_and_too_little_time(folder: Path) -> None:
     """More words than can be numbered are refused with the number; an answer past its deadline is given up."""
     config = LlmConfig(tiers=("local",), local_model=str(folder), local_deadline_s=60.0)

@@ -39,7 +39,7 @@ def model_card(
         precision: of the weights.
         recipe: how it was trained.
         figures: on what was held out, by split, as training told them at its end; before the weights were rounded.
-        made: `megabytes`, `calibration`, `reliability`.
+        made: `megabytes`, `calibration`, `reliability`, `beside`.
         cases: held-out pairs that the confidence was calibrated on.
     """
     splits: dict[str, Mapping[str, Any]] = {name: each for name, each in figures.items() if isinstance(each, Mapping)}
@@ -65,6 +65,14 @@ def model_card(
             f"- **Training**: {figures.get('step', '?')} steps; {settings}.",
             "- **Second opinion** (`evidence.bin`): a linear classifier of the skills that words speak for, trained on",
             "  the same pairs; it has a say in which of several answers is given.",
+            *(
+                [
+                    f"- **Asked together**: this model and the one in `{', '.join(made['beside'])}`, which was trained",
+                    "  like it; an answer is as likely as both together find it.",
+                ]
+                if made.get("beside")
+                else []
+            ),
             "- **Limits**: English only; 256 words with the roster; names only as they are said; no task that has",
             "  begun is continued. What it plans is checked by the validator and the safety policy in any case.",
             "",

@@ -18,12 +18,16 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from msgspec.structs import replace
+
+from appliance.errors import ConflictError, NotFoundError
+from appliance.llm.embedded import folder_of
 from appliance.llm.language.codec import read
 from appliance.llm.language.evidence import write_evidence
 from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import words_of
 from appliance.llm.slot import Slot
-from appliance.llm.speaking import Question
+from appliance.llm.speaking import Card, Question, read_card
 from appliance.llm.train.card import card_of, model_card, write_card
 from appliance.llm.train.corpus import corpus_examples
 from appliance.llm.train.ending import ended
@@ -38,7 +42,14 @@ from appliance.skills.catalogue import Catalogue
 BINS = 10
 
 
-def export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -> dict[str, object]:
+BESIDE = "second"
+"""Folder, in that of a planner, of the model that is asked besides."""
+_FILES = ("genai_config.json", "model.onnx", "model.onnx.data", "tokenizer.json", "tokenizer_config.json")
+
+
+def export(
+    run: Path, folder: Path, *, precision: str = "int4", most: int = 0, beside: Path | None = None
+) -> dict[str, object]:
     """Write the model folder; return the reliability curve and how large it is.
 
     Args:
@@ -46,6 +57,11 @@ def export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -
         folder: where to; must not exist.
         precision: int4, int8 or fp32, as the builder knows them.
         most: held-out pairs to calibrate on, drawn evenly from all; 0: all of them.
+        beside: folder of a planner whose model is asked besides; it must have the same tokens.
+
+    Raises:
+        NotFoundError: there is no planner in `beside`.
+        ConflictError: its tokens are others.
     """
     catalogue = catalogue_of(run)
     tokens = Tokens.load(run)
@@ -71,19 +87,43 @@ def export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -
         subprocess.run([*command, *(["--extra_options", *options] if options else [])], check=True)
     recipe = json.loads((run / "recipe.json").read_text())
     twice = bool(recipe.get("twice"))
-    write_card(folder, card_of(tokens, catalogue, twice=twice))
+    card = card_of(tokens, catalogue, twice=twice)
+    if beside is not None:
+        _put_beside(folder, beside, card)
+        card = replace(card, beside=(BESIDE,))
+    write_card(folder, card)
     parts = split(corpus_examples(catalogue))
     write_evidence(folder, learn(parts.train, catalogue))
     held_out = [*parts.structure, *parts.vocabulary, *parts.chance]
     held_out = held_out[:: max(1, len(held_out) // most)] if most else held_out
     slope, offset, curve = calibrate(folder, held_out, catalogue)
-    write_card(folder, card_of(tokens, catalogue, calibration=(slope, offset), twice=twice))
+    write_card(folder, replace(card, calibration=(slope, offset)))
     size = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
     kept = run / "figures.json"
     figures = json.loads(kept.read_text()) if kept.is_file() else {}
-    made = {"megabytes": round(size / 1e6, 1), "calibration": [slope, offset], "reliability": curve}
+    made = {
+        "megabytes": round(size / 1e6, 1),
+        "calibration": [slope, offset],
+        "reliability": curve,
+        "beside": list(card.beside),
+    }
     (folder / "README.md").write_text(model_card(precision, recipe, figures, made, cases=len(held_out)))
     return made
+
+
+def _put_beside(folder: Path, beside: Path, card: Card) -> None:
+    """Copy the model of another planner into a planner's folder."""
+    other = read_card(beside)
+    if other is None:
+        raise NotFoundError(f"{beside} is no planner", remedy="give a folder that `swiftbot train export` made")
+    if other.tokens != card.tokens:
+        raise ConflictError(
+            f"{beside} has other tokens than {folder}", remedy="give a planner of a run that began with the same one"
+        )
+    (folder / BESIDE).mkdir()
+    for name in _FILES:
+        shutil.copyfile(beside / name, folder / BESIDE / name)
+    write_card(folder / BESIDE, replace(other, beside=()))
 
 
 def calibrate(
@@ -145,8 +185,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("folder", type=Path, help="where to")
     parser.add_argument("--precision", default="int4", choices=("int4", "int8", "fp32"))
     parser.add_argument("--most", type=int, default=0, help="held-out pairs to calibrate on; 0 for all")
+    parser.add_argument("--beside", help="a planner's folder, or `embedded`: its model is asked besides")
     given = parser.parse_args(arguments)
-    made = export(given.run, given.folder, precision=given.precision, most=given.most)
+    beside = Path(folder_of(given.beside)) if given.beside else None
+    made = export(given.run, given.folder, precision=given.precision, most=given.most, beside=beside)
     print(json.dumps(made, indent=1))
     return 0
 
