@@ -56,12 +56,32 @@ class Voice:
         Raises:
             TooLongError: too many words, or tokens.
         """
-        prompt = self._read(words, own)
+        prompt = self.read(words, own)
         self._prompt = len(prompt)
         self._generator = None  # the one before goes first: two take twice the memory
         self._generator = self._new()
         self._generator.append_tokens(prompt)
         return self._context - len(prompt) - 2
+
+    def read(self, words: Sequence[str], own: int) -> list[int]:
+        """Return the tokens of the prompt. As `begin`."""
+        tokens = self._tokens
+        if len(words) > MAX_WORDS:
+            raise TooLongError(f"{len(words)} words and robots, more than {MAX_WORDS}")
+        found = [tokens["<begin>"]]
+        for number, word in enumerate(words):
+            if number == own:
+                found.append(tokens["<roster>"])
+            found.append(tokens[f"w{number}"])
+            found += self._cut(word)
+        found.append(tokens["<plan>"])
+        if self._twice:
+            first = [tokens["<begin>"], *(piece for word in words[:own] for piece in self._cut(word))]
+            if len(first) + len(found) + ROOM <= self._context:
+                found = [*first, *found]
+        if len(found) + LEAST > self._context:
+            raise TooLongError(f"{len(found)} tokens, more than the planner's {self._context} leave room for")
+        return found
 
     @property
     def prompt(self) -> int:
@@ -83,25 +103,6 @@ class Voice:
     def set_back(self, answer: int) -> None:
         """Take back what was said behind so many tokens of the answer."""
         self._generator.rewind_to(self._prompt + answer)
-
-    def _read(self, words: Sequence[str], own: int) -> list[int]:
-        tokens = self._tokens
-        if len(words) > MAX_WORDS:
-            raise TooLongError(f"{len(words)} words and robots, more than {MAX_WORDS}")
-        found = [tokens["<begin>"]]
-        for number, word in enumerate(words):
-            if number == own:
-                found.append(tokens["<roster>"])
-            found.append(tokens[f"w{number}"])
-            found += self._cut(word)
-        found.append(tokens["<plan>"])
-        if self._twice:
-            first = [tokens["<begin>"], *(piece for word in words[:own] for piece in self._cut(word))]
-            if len(first) + len(found) + ROOM <= self._context:
-                found = [*first, *found]
-        if len(found) + LEAST > self._context:
-            raise TooLongError(f"{len(found)} tokens, more than the planner's {self._context} leave room for")
-        return found
 
     def _cut(self, word: str) -> list[int]:
         pieces = self._pieces.get(word)

@@ -1,5 +1,6 @@
 """The models of a planner asked as one: tiny ones with random weights, by the library that runs them."""
 
+import importlib
 import importlib.util
 import itertools
 from collections.abc import Callable
@@ -62,8 +63,9 @@ def card_in(folder: Path) -> Card:
 
 def voice_of(folder: Path, *, twice: bool = False, context: int = 1024) -> Voice:
     """Return a folder's own model."""
-    slot = Slot(folder)
-    return Voice(slot._og, slot._model, slot._tokenizer, card_in(folder).tokens, twice=twice, context=context)
+    og: Any = importlib.import_module("onnxruntime_genai")
+    model = og.Model(str(folder))
+    return Voice(og, model, og.Tokenizer(model), card_in(folder).tokens, twice=twice, context=context)
 
 
 def test_a_model_that_was_set_back_says_the_same(make: Make) -> None:
@@ -126,15 +128,15 @@ def test_the_prompt_is_that_of_the_training(make: Make, twice: bool) -> None:
     """Token by token, once or twice: a model is asked as it was taught."""
     folder = make(7)
     voice = voice_of(folder, twice=twice)
-    assert voice._read(WORDS, OWN) == Tokens.load(folder).prompt(WORDS, OWN, twice=twice)
+    assert voice.read(WORDS, OWN) == Tokens.load(folder).prompt(WORDS, OWN, twice=twice)
 
 
 def test_a_long_instruction_is_read_once_and_a_longer_one_not_at_all(make: Make) -> None:
     """Where there is no room to read it twice it is read as it was taught to be then; past that it is refused."""
     folder = make(7)
     voice, once = voice_of(folder, twice=True), voice_of(folder)
-    lengths = [len(voice._read(["go"] * count, count)) for count in range(1, MAX_WORDS)]
-    plain = [len(once._read(["go"] * count, count)) for count in range(1, MAX_WORDS)]
+    lengths = [len(voice.read(["go"] * count, count)) for count in range(1, MAX_WORDS)]
+    plain = [len(once.read(["go"] * count, count)) for count in range(1, MAX_WORDS)]
     steps = {two - one for one, two in itertools.pairwise(lengths)}
     assert len([each for each in steps if each < 0]) == 1, "from twice to once, at one length"
     assert all(each + ROOM <= 1024 or each == short for each, short in zip(lengths, plain, strict=True))
