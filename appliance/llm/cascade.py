@@ -185,7 +185,9 @@ class Decomposer:
         context = PlanContext(instruction=ask.instruction, robots=ask.robots)
         async with self._gate.turn(), _deadline(slot.deadline_s, "local"):
             proposal = await slot.planner.propose(context)
-        return Proposed(plan=proposal.plan, confidence=proposal.confidence, model=proposal.model)
+        return Proposed(
+            plan=proposal.plan, confidence=proposal.confidence, doubtful=proposal.doubtful, model=proposal.model
+        )
 
     async def plan(self, context: PlanContext) -> PlanOutcome:
         """Plan an instruction.
@@ -386,6 +388,9 @@ class Decomposer:
         least = max(slot.min_confidence, self.memory.thresholds.of(tier))
         if confidence < least:
             why = f"confidence {confidence:.2f} is below {least:.2f}"
+            return proposal, attempt(ok=False, confidence=confidence, problems=(why, *proposal.problems)), True
+        if proposal.doubtful and not slot.takes_doubtful:
+            why = "it breaks a rule of plans, of which no confidence is enough"
             return proposal, attempt(ok=False, confidence=confidence, problems=(why, *proposal.problems)), True
         return proposal, attempt(ok=True, confidence=confidence, problems=proposal.problems), True
 

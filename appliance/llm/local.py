@@ -44,9 +44,10 @@ _NO_PLAN = {
     "unclear": "it does not say what to do, or with what",
     "language": "only English is understood",
 }
-_UNSOUND = 0.8
-"""Times `local_min_confidence`: how sure it can be of a plan that breaks a rule of plans, so that another tier or an
-operator is asked. Of held-out instructions no such plan was right; yet a program reads the rules strictly."""
+_UNSOUND = 0.48
+"""How sure it can be of a plan that breaks a rule of plans: another tier is asked whatever the threshold is, and with
+`safety.confirm_below` as it is shipped an operator. Of held-out instructions no such plan was right; yet a program
+reads the rules strictly."""
 _DOUBTFUL = 1
 """How much a plan is broken that is merely doubtful (`doubts`)."""
 _FAR = 0.05
@@ -292,9 +293,9 @@ class LocalTier:
         if not broken:
             return best
         # With its problems, for whoever repairs or refuses it, and at most for an operator to look at.
-        most = _UNSOUND * self._config.local_min_confidence
         why = doubts(_meaning(best.plan, context)) if broken == _DOUBTFUL else ()
-        return msgspec.structs.replace(best, confidence=min(best.confidence, most), problems=(*best.problems, *why))
+        sure = min(best.confidence, _UNSOUND)
+        return msgspec.structs.replace(best, confidence=sure, doubtful=True, problems=(*best.problems, *why))
 
     async def _asked(self, process: ModelProcess, question: Question) -> Said:
         said = _said(await process.exchange({"question": msgspec.to_builtins(question)}))

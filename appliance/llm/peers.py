@@ -33,6 +33,8 @@ class Proposed(Struct, frozen=True, kw_only=True):
 
     plan: Plan
     confidence: float
+    doubtful: bool = False
+    """As in `Proposal`; gateways of an earlier version do not say it."""
     model: str = ""
 
 
@@ -116,7 +118,13 @@ class PeerTier:
                 raise
             else:
                 breaker.succeeded()
-                return Proposal(plan=answer.plan, confidence=answer.confidence, model=answer.model, gateway=name)
+                return Proposal(
+                    plan=answer.plan,
+                    confidence=answer.confidence,
+                    doubtful=answer.doubtful,
+                    model=answer.model,
+                    gateway=name,
+                )
         raise UnreachableError(
             f"no other gateway's model answered: {'; '.join(lacked) or 'those that have one failed lately'}",
             remedy="see `swiftbot fleet` for who has a model",

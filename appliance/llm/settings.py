@@ -41,7 +41,8 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     local_start_s: float = 120.0
     """Loading a model and its fixed prompt; large int4 models take tens of seconds on slow disks."""
     local_min_confidence: float = 0.6
-    """Below it the next tier is asked; the slot's margins are not calibrated for every model, so not too strict."""
+    """Below it the next tier is asked, and whatever it is when a plan breaks a rule of plans (two ways at once, say);
+    the slot's margins are not calibrated for every model, so not too strict."""
     local_max_words: int = 150
     """Longer instructions go straight to the next tier: small models lose track in long ones."""
     local_max_tokens: int = 8192

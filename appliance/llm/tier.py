@@ -23,6 +23,8 @@ class Proposal(Struct, frozen=True, kw_only=True):
     likely: float | None = None
     """How likely it is right, 0 to 1, where `confidence` says something else: the rules' is the share of the words
     that they understood. None: as likely as its confidence says."""
+    doubtful: bool = False
+    """It breaks a rule of plans: no threshold is so low that it is sure enough by itself."""
     model: str = ""
     """The model that wrote it; empty for rules."""
     gateway: str = ""

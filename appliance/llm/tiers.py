@@ -24,6 +24,8 @@ class Slot(Struct, frozen=True, kw_only=True):
     """Whether its valid plan may be taken, below its own threshold, when nothing better came."""
     grounded: bool = True
     """Whether its plans are held to the words of the instruction (`safety.grounding`): models invent, rules do not."""
+    takes_doubtful: bool = False
+    """Whether a plan that breaks a rule of plans may be taken before other tiers are asked: to measure this one."""
     instead_of: Tier | None = None
     """Asked only when that tier made no proposal at all: its second opinion would be the same."""
 

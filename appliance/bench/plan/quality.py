@@ -97,7 +97,17 @@ async def run(
         "upstream": wanted.upstream_min_confidence,
         "rules": wanted.rules_min_confidence,
     }
-    decomposer = Decomposer(asking, catalogue)
+    paid = Budget(
+        cost=wanted.upstream_budget,
+        requests=wanted.upstream_requests,
+        price_in=wanted.upstream_price_in,
+        price_out=wanted.upstream_price_out,
+    )
+    slots = [
+        msgspec.structs.replace(each, takes_doubtful=True)
+        for each in configured(asking, catalogue, None, lambda: (paid, lambda: None))
+    ]
+    decomposer = Decomposer(asking, catalogue, slots=slots)
     await decomposer.start()
     rows: list[Score] = []
     answered: list[Answered] = []

@@ -205,6 +205,35 @@ async def test_rules_need_not_be_likely_where_no_model_has_a_plan(build: Build) 
     assert outcome.plan.tier is Tier.RULES
 
 
+async def test_no_threshold_is_low_enough_for_a_doubtful_plan(catalogue: Catalogue) -> None:
+    """With a threshold of 0 any plan is sure enough but one that breaks a rule of plans: the next is asked first."""
+    two = PlanContext(instruction="go to dock 1, or to dock 2")
+    doubtful = Proposal(plan=going("dock 2"), confidence=0.4, doubtful=True)
+    for answer, other, tier, asked in (
+        (Proposal(plan=going("dock 2"), confidence=0.0), sure(going()), Tier.LOCAL, 0),
+        (doubtful, sure(going()), Tier.UPSTREAM, 1),
+        (doubtful, UnreachableError("gone"), Tier.LOCAL, 1),
+    ):
+        local, upstream = FakeTier(Tier.LOCAL, answer), FakeTier(Tier.UPSTREAM, other)
+        slots = [Slot(planner=each, deadline_s=60.0, min_confidence=0.0) for each in (local, upstream)]
+        outcome = await Decomposer(LlmConfig(), catalogue, slots=slots).plan(two)
+        assert (outcome.plan.tier, len(upstream.asked)) == (tier, asked)
+        if answer is doubtful:
+            assert "breaks a rule" in outcome.attempts[0].problems[0]
+
+
+async def test_what_is_measured_may_be_doubtful(catalogue: Catalogue) -> None:
+    """A slot can be told to take such a plan, so that what the tier proposes can be scored."""
+    local = FakeTier(Tier.LOCAL, Proposal(plan=going(), confidence=0.4, doubtful=True))
+    upstream = FakeTier(Tier.UPSTREAM)
+    slots = [
+        Slot(planner=local, deadline_s=60.0, min_confidence=0.0, takes_doubtful=True),
+        Slot(planner=upstream, deadline_s=60.0, min_confidence=0.0),
+    ]
+    outcome = await Decomposer(LlmConfig(), catalogue, slots=slots).plan(ASK)
+    assert (outcome.plan.tier, upstream.asked) == (Tier.LOCAL, [])
+
+
 async def test_very_unsure_plan_is_not_taken(build: Build) -> None:
     """Below the floor even a valid plan is refused."""
     with pytest.raises(PlanError, match=r"confidence 0\.05 is below 0\.60"):

@@ -242,14 +242,14 @@ async def test_peers_are_asked_in_turn_and_left_alone_when_they_fail() -> None:
         asked.append(gateway)
         if gateway == "a":
             raise UnreachableError("gone")
-        return Proposed(plan=going(), confidence=0.9, model="m")
+        return Proposed(plan=going(), confidence=0.9, doubtful=True, model="m")
 
     statuses = {"a": having("a"), "b": having("b", load=0.9)}
     tier = PeerTier(LlmConfig(), gateways=lambda: statuses, ask=ask, here="me")
     assert tier.present
     for _ in range(3):
         proposal = await tier.propose(ASK)
-        assert (proposal.gateway, proposal.model) == ("b", "m")
+        assert (proposal.gateway, proposal.model, proposal.doubtful) == ("b", "m", True)
     assert asked == ["a", "b", "a", "b", "b"]
     statuses.pop("b")
     with pytest.raises(UnreachableError, match="no other gateway's model answered"):
@@ -270,9 +270,9 @@ async def test_a_peer_is_asked_only_when_the_own_model_said_nothing(build: Build
 
 async def test_what_a_gateway_answers_to_others(build: Build) -> None:
     """The local model's proposal unchecked, the refusal of what is no instruction, or that there is no model."""
-    cascade = build(FakeTier(Tier.LOCAL, replace(sure(going(), 0.3), model="m")))
+    cascade = build(FakeTier(Tier.LOCAL, replace(sure(going(), 0.3), model="m", doubtful=True)))
     answer = await cascade.propose(ProposeAsk(instruction="go to dock 1"))
-    assert (answer.confidence, answer.model) == (0.3, "m")
+    assert (answer.confidence, answer.model, answer.doubtful) == (0.3, "m", True)
     with pytest.raises(PlanError, match="empty"):
         await cascade.propose(ProposeAsk(instruction=" "))
     with pytest.raises(ConfigError, match="gw-1 has no local model"):

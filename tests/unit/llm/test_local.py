@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError
 from appliance.llm.local import LocalTier
+from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
 from appliance.model import RobotInfo
@@ -126,9 +127,12 @@ async def test_the_plan_there_is_outlives_a_second_look_that_fails() -> None:
 
 
 async def test_no_threshold_lets_a_plan_through_that_breaks_a_rule() -> None:
-    """However low a site sets `llm.local_min_confidence`, it is below it."""
-    model = Model([(NOWHERE, 0.8)])
-    assert (await proposed(model, least=0.2)).confidence < 0.2
+    """However low a site sets `llm.local_min_confidence`, it is called doubtful and is less than half sure."""
+    for least in (0.6, 0.2, 0.0):
+        proposal = await proposed(Model([(NOWHERE, 0.8)]), least=least)
+        assert proposal.doubtful
+        assert 0.0 < proposal.confidence < SafetyConfig().confirm_below
+        assert not (await proposed(Model([(RIGHT, 0.01)]), least=least)).doubtful
 
 
 @pytest.mark.parametrize(
