@@ -5,7 +5,8 @@ every other mark is a word of its own, blanks are none. Words keep where they st
 text as it was written. The robots of the roster follow as words after the instruction's own.
 
 Lines of a list are read as one sentence: what stands before an item ("2.", "b)", "-") is no figure of the order before
-it, and the end of a line parts as a mark does.
+it, and the end of a line parts as a mark does. A letter stands before an item only where the lines' letters follow one
+another (a, b, c): else it is somebody's initial ("A. Smith waits").
 """
 
 import re
@@ -17,6 +18,8 @@ MAX_WORDS = 256
 """Words of an instruction and its roster; a longer one is for another planner."""
 _ITEM = re.compile(r"(?:\(?(?:\d{1,2}|[a-z])[.)](?=\s)|\d{1,2}:(?=\s)|[-–—*•·](?=\s))\s*", re.IGNORECASE)
 """What stands before an item of a list."""
+_LETTER = re.compile(r"[a-z]\.\s", re.IGNORECASE)
+"""How a line begins whose item has a letter, or where somebody is called by an initial."""
 _BY_NUMBER = re.compile(
     r"\b(?:step|item|point|line|number|after|once|until|before|with|and)s?\s+#?\d{1,2}\b"
     r"(?=\s*(?:$|[,;:)!]|[.](?!\d)|(?:is|are|has|have|was|and|or)\b))",
@@ -66,7 +69,7 @@ def in_one_line(instruction: str) -> str:
     lines = [line.strip() for line in instruction.splitlines() if line.strip()]
     if len(lines) < 2:
         return instruction
-    items = [_ITEM.match(line) for line in lines]
+    items = _items(lines)
     numbered = _BY_NUMBER.search(
         " ".join(line[item.end() :] if item else line for line, item in zip(lines, items, strict=True))
     )
@@ -80,3 +83,24 @@ def in_one_line(instruction: str) -> str:
             goes_on = re.match(r"(?:and|then|or|but)\b", lines[number + 1], re.IGNORECASE)
             made += " " if ended else ": " if heads else ", " if goes_on else "; "
     return made
+
+
+def _items(lines: Sequence[str]) -> list[re.Match[str] | None]:
+    """Return what stands before the item of each line, if anything does.
+
+    "a)" always does; "a." may be somebody's initial, and does only in a list: from a (or A) on, letter after letter,
+    whatever lines stand between.
+    """
+    items = [_ITEM.match(line) for line in lines]
+    letters = {number: line[0] for number, line in enumerate(lines) if _LETTER.match(line)}
+    runs: list[list[int]] = []
+    for number, letter in letters.items():
+        if runs and ord(letter) == ord(letters[runs[-1][-1]]) + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    for run in runs:
+        if len(run) < 2 or letters[run[0]] not in "aA":
+            for number in run:
+                items[number] = None
+    return items
