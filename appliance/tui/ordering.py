@@ -88,7 +88,18 @@ class Ordering(Shell):
         return False
 
     def _ask_for(self, command: Command) -> None:
-        """Have a person write what is missing; what is given stands there already."""
+        """Have a person write what is missing; what is given stands there already.
+
+        Of the questions that wait the oldest is taken where none is selected, and who asks what is said beside it.
+        """
+        asked = self.view.store.enquiries
+        if any(each.kind == "enquiry" for each in command.missing):
+            waiting = [each for each in asked.values() if each.open]
+            if not waiting:
+                self.notify("nothing is asked")
+                return
+            oldest = min(waiting, key=lambda each: each.at_ns)
+            command = grammar.fill(command.action, command.given, {"enquiry": oldest.id})
         words = [command.action.name]
         for parameter in command.action.takes:
             if parameter.name not in command.given:
@@ -96,6 +107,12 @@ class Ordering(Shell):
             words.append(command.given[parameter.name])
         if self.front is not None:
             note = f"{', '.join(each.name for each in command.missing)}? {command.action.usage}"
+            for parameter in command.action.takes:
+                if (
+                    parameter.kind == "enquiry"
+                    and (one := asked.get(command.given.get(parameter.name, ""))) is not None
+                ):
+                    note = f"{safe(one.robot or one.task or 'a skill', 40)} asks: {safe(one.question, 160)} · {note}"
             self.front.prompt.open(":", " ".join(words) + " ", note)
 
     def carry_out(self, command: Command) -> None:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.errors import ConfigError, SwiftbotError
-from appliance.model import SoftStop
+from appliance.model import Enquiry, SoftStop
 from appliance.pool.api import Evicted, Released, Warmed
 from appliance.pool.transfer.api import Brought
 from appliance.robots.authority.api import StopAnswer
@@ -23,6 +24,7 @@ from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.dialogs import ConfirmDialog, TextDialog
 from appliance.tui.filter import Filter
+from appliance.tui.grid import Grid
 from appliance.tui.keys import keymap
 from appliance.tui.replay.source import ReplayView
 from appliance.tui.settings import TuiConfig
@@ -320,6 +322,41 @@ async def test_what_is_missing_is_asked_for(view: "FakeView") -> None:
         assert "reference? :fetch REFERENCE GATEWAY" in text
         assert app.front is not None
         assert app.front.prompt.field.value == "fetch "
+
+
+async def test_the_waiting_question_is_answered_whichever_robot_is_selected(view: "FakeView") -> None:
+    """`A` takes the selected robot's question, else the oldest; who asks what is said, or that nobody asks."""
+    answered = Enquiry(id="q-0", robot="rover-1", question="old?", answer="yes", at_ns=1)
+    view.store.enquiries.put("q-0", answered)
+    app = SwiftbotApp(view, UNLOCKED)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("3")
+        assert app.front is not None
+        robots = app.front.query_one("#robots", Grid)
+        await settle(app, pilot)
+        assert robots.selected == "drone-1"
+        await pilot.press("A")
+        await settle(app, pilot)
+        assert [each.message for each in app._notifications] == ["nothing is asked"]
+        assert not app.front.prompt.display
+        view.store.enquiries.put(
+            "q-2", Enquiry(id="q-2", robot="rover-1", question="Is the \x1b[31mway clear?", at_ns=3)
+        )
+        view.store.enquiries.put("q-1", Enquiry(id="q-1", robot="rover-2", question="Which box?", at_ns=2))
+        await settle(app, pilot)
+        await pilot.press("A")
+        assert "rover-2 asks: Which box? · answer?" in await settle(app, pilot)
+        assert app.front.prompt.field.value == "answer q-1 "
+        await pilot.press("escape", "down")
+        await settle(app, pilot)
+        assert robots.selected == "rover-1"
+        await pilot.press("A")
+        assert "rover-1 asks: Is the ␛[31mway clear?" in await settle(app, pilot)
+        assert app.front.prompt.field.value == "answer q-2 "
+        view.orders.answers["answer"] = replace(answered, id="q-2", answer="no")
+        await pilot.press(*"no", "enter")
+        await settle(app, pilot)
+    assert view.orders.of("answer") == [("q-2", "no")]
 
 
 async def test_history_and_tab(view: "FakeView") -> None:
