@@ -184,10 +184,8 @@ class Decomposer:
             raise ConfigError(f"{self._gateway} has no local model", remedy="see `swiftbot fleet` for who has one")
         context = PlanContext(instruction=ask.instruction, robots=ask.robots)
         async with self._gate.turn(), _deadline(slot.deadline_s, "local"):
-            proposal = await slot.planner.propose(context)
-        return Proposed(
-            plan=proposal.plan, confidence=proposal.confidence, doubtful=proposal.doubtful, model=proposal.model
-        )
+            said = await slot.planner.propose(context)
+        return Proposed(plan=said.plan, confidence=said.confidence, doubtful=said.doubtful, model=said.model)
 
     async def plan(self, context: PlanContext) -> PlanOutcome:
         """Plan an instruction.
@@ -301,11 +299,9 @@ class Decomposer:
             log.info("a plan of the cache does not hold any more", problems=problems)
             self.memory.forget_plan(key)
             return None
+        elapsed = round(1000 * (time.monotonic() - began), 3)
         plan = msgspec.structs.replace(
-            kept.plan,
-            tier=Tier.CACHE,
-            confidence=round(kept.confidence, 4),
-            latency_ms=round(1000 * (time.monotonic() - began), 3),
+            kept.plan, tier=Tier.CACHE, confidence=round(kept.confidence, 4), latency_ms=elapsed
         )
         first = kept.plan.provenance
         return _Found(
@@ -386,13 +382,12 @@ class Decomposer:
         if problems:
             return None, attempt(ok=False, confidence=confidence, problems=(*problems, *proposal.problems)), True
         least = max(slot.min_confidence, self.memory.thresholds.of(tier))
+        lacks: tuple[str, ...] = ()
         if confidence < least:
-            why = f"confidence {confidence:.2f} is below {least:.2f}"
-            return proposal, attempt(ok=False, confidence=confidence, problems=(why, *proposal.problems)), True
-        if proposal.doubtful and not slot.takes_doubtful:
-            why = "it breaks a rule of plans, of which no confidence is enough"
-            return proposal, attempt(ok=False, confidence=confidence, problems=(why, *proposal.problems)), True
-        return proposal, attempt(ok=True, confidence=confidence, problems=proposal.problems), True
+            lacks = (f"confidence {confidence:.2f} is below {least:.2f}",)
+        elif proposal.doubtful and not slot.takes_doubtful:
+            lacks = ("it breaks a rule of plans, of which no confidence is enough",)
+        return proposal, attempt(ok=not lacks, confidence=confidence, problems=(*lacks, *proposal.problems)), True
 
     def _paid(self) -> None:
         self.memory.spent()

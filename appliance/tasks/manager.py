@@ -17,12 +17,9 @@ from appliance.errors import (
     ConflictError,
     DeadlineError,
     NotFoundError,
-    PlanError,
     UnreachableError,
 )
 from appliance.llm.cascade import Decomposer
-from appliance.llm.settings import PlanContext
-from appliance.llm.validate import validate
 from appliance.model import (
     Group,
     Plan,
@@ -33,7 +30,6 @@ from appliance.model import (
     SubtaskRecord,
     TaskRecord,
     TaskRequest,
-    TaskState,
     encode,
 )
 from appliance.plane.node import Plane
@@ -42,8 +38,6 @@ from appliance.tasks import machine, resolve
 from appliance.tasks.admission import Admission, checked, expectation, longest_s
 from appliance.tasks.api import (
     ExperienceAsk,
-    ExperienceList,
-    PlanAnswer,
     PlanAsk,
     SkillsAsk,
     TaskAsk,
@@ -60,15 +54,13 @@ from appliance.tasks.line import Place
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Placement
+from appliance.tasks.plans import Plans
 from appliance.tasks.questions import Questions
-from appliance.tasks.recovery import Recovery, rest_of
-from appliance.tasks.replan.splice import problems
+from appliance.tasks.recovery import Recovery
 from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.steering.api import CancelTaskAsk, PlanCheckAsk, PlanChecked
+from appliance.tasks.steering.api import CancelTaskAsk, PlanCheckAsk
 from appliance.tasks.steering.audit import Audit
-from appliance.tasks.steering.deciding import needs_approval
-from appliance.tasks.steering.hashing import plan_hash
 from appliance.tasks.steering.verbs import OperatorVerbs
 from appliance.tasks.surroundings import FREE, Commands, GatewayLost, RunNews, Wake, task_key
 
@@ -96,9 +88,7 @@ class TaskManager:
         self.commands = commands
         self._audit = audit or Audit(plane.session, plane.keys, plane.gateway)
         self._catalogue = catalogue
-        self._decomposer = decomposer
         self._executor = executor
-        self._site = site
         self._ages = Ages()
         self._admission = Admission(plane.gateway, config.max_tasks)
         self._driving = Driving(self, ages=self._ages, moved=self._moved, ended=self._has_ended, changed=self._tell)
@@ -133,6 +123,9 @@ class TaskManager:
         )
         self.task, self.tasks, self.why = questions.task, questions.tasks, questions.why
         self.cancel, self.cancel_here = questions.cancel, questions.cancel_here
+        plans = Plans(config, plane, catalogue=catalogue, decomposer=decomposer, site=site, task=questions.task)
+        self.plan, self.approval, self.plan_problems = plans.plan, plans.approval, plans.problems
+        self.plan_check, self.plan_only, self.experience = plans.check, plans.propose, plans.experience
         self._closers: list[Callable[[], None]] = []
         self.on_change: Callable[[], None] = lambda: None
 
@@ -301,83 +294,6 @@ class TaskManager:
                     driver.tell(Wake())
 
     # --- what drivers need ------------------------------------------------------------------------------------
-
-    async def plan(self, record: TaskRecord) -> Plan:
-        """Return the plan handed in with the task if it is valid, else a new one."""
-        context = self._context(record.instruction, submitter=record.submitter)
-        if record.plan is not None:
-            if problems := self._decomposer.check(record.plan, context):
-                raise PlanError("the plan handed in is not valid", problems=problems)
-            return record.plan
-        return (await self._decomposer.plan(context)).plan
-
-    def approval(self, record: TaskRecord, plan: Plan) -> str:
-        """Why a plan has to be approved before it takes effect; "" when it need not be."""
-        wanted = needs_approval(
-            plan,
-            record.approval.stricter(self.config.approval),
-            manifests=self._catalogue.skills,
-            robots=self.plane.registry.robots,
-        )
-        # A person who hands in a plan has seen it; a robot's, or one that was made here, nobody has.
-        doubts: tuple[str, ...] = ()
-        if not record.handed_in:
-            doubts = plan.provenance.confirm if plan.provenance is not None else ()
-        elif record.submitter in self.plane.registry.robots:
-            doubts = self._decomposer.confirm(plan)
-        return "; ".join((*doubts, wanted) if wanted else doubts)
-
-    def plan_problems(self, record: TaskRecord | None, plan: Plan) -> tuple[str, ...]:
-        """What is wrong with a plan just now; of a task that runs, with the continuation that it is."""
-        if record is not None and record.state is TaskState.RUNNING:
-            wrong = validate(plan, self._catalogue) or problems(record, plan, self._catalogue.skills)
-            if wrong:
-                return tuple(wrong)
-            try:
-                plan = rest_of(record, plan)
-            except PlanError as error:
-                return (error.message, *error.problems)
-        submitter, instruction = (record.submitter, record.instruction) if record is not None else ("", "")
-        return self._decomposer.check(plan, self._context(instruction, submitter=submitter))
-
-    async def plan_check(self, ask: PlanCheckAsk) -> PlanChecked:
-        """Answer `plan_check`."""
-        record = await self.task(TaskAsk(id=ask.task)) if ask.task else None
-        wrong = self.plan_problems(record, ask.plan)
-        wanted = self.config.approval.stricter(record.approval) if record is not None else self.config.approval
-        skills, robots = self._catalogue.skills, self.plane.registry.robots
-        approval = "" if wrong else needs_approval(ask.plan, wanted, manifests=skills, robots=robots)
-        return PlanChecked(problems=wrong, hash=plan_hash(ask.plan), approval=approval)
-
-    async def plan_only(self, ask: PlanAsk) -> PlanAnswer:
-        """Decompose an instruction against the present roster and site; run nothing."""
-        instruction = checked(TaskRequest(instruction=ask.instruction), self.config).instruction
-        context = self._context(instruction, private=ask.private)
-        outcome = await self._decomposer.plan(context)
-        analysis = self._decomposer.analyse(context, outcome.plan)
-        return PlanAnswer(plan=outcome.plan, attempts=outcome.attempts, analysis=analysis)
-
-    def _context(self, instruction: str, *, submitter: str = "", private: bool = False) -> PlanContext:
-        """What is known now that bears on an instruction."""
-        roster = self.plane.registry.robots
-        return PlanContext(
-            instruction=instruction,
-            robots=tuple(sorted(roster.values(), key=lambda robot: robot.id)),
-            site=self._site,
-            private=private,
-            submitter=submitter,
-            from_robot=submitter in roster,
-        )
-
-    async def experience(self, ask: ExperienceAsk) -> ExperienceList:
-        """Tell how skills have done on robots lately, by what this gateway has heard."""
-        memory = self._decomposer.memory
-        return ExperienceList(
-            gateway=self.plane.gateway,
-            rows=tuple(memory.experience.rows()[: max(0, ask.limit)]),
-            thresholds=memory.thresholds.all,
-            confirm_below=memory.thresholds.confirm_below,
-        )
 
     def manifest(self, skill: str) -> SkillManifest:
         """Return a skill's manifest; NotFoundError when this gateway does not know it (another may)."""

@@ -34,6 +34,8 @@ from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import driving as module
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.manager import TaskManager
+from appliance.tasks.plans import Plans
+from appliance.tasks.settings import TasksConfig
 from appliance.tasks.steering.api import CancelTaskAsk
 
 pytestmark = pytest.mark.anyio
@@ -280,12 +282,14 @@ def test_a_watcher_follows_a_coordinator_that_came_back_with_lower_numbers(plane
 async def test_a_plan_that_a_robot_hands_in_waits_where_the_policy_says_so(manager: TaskManager, plane: Any) -> None:
     """`confirm_skills` holds for robots' plans too; a person who hands in a plan has seen it."""
     policy = SafetyConfig(confirm_skills=("push",))
-    manager._decomposer = Decomposer(LlmConfig(tiers=("rules",)), load_catalogue(), safety=policy)
+    catalogue = load_catalogue()
+    decomposer = Decomposer(LlmConfig(tiers=("rules",)), catalogue, safety=policy)
+    plans = Plans(TasksConfig(), plane, catalogue=catalogue, decomposer=decomposer, site=Site(), task=manager.task)
     plane.registry.robots["rover_1"] = RobotInfo(id="rover_1", kind="zenoh")
     plan = plane.plan_of(Subtask(id="s1", skill="push", robot="rover_1"))
     record = plane.accepted(plan=plan)
     assert record.handed_in
-    assert "safety.confirm_skills" in manager.approval(replace(record, submitter="rover_1"), plan)
-    assert manager.approval(replace(record, submitter="ann"), plan) == ""
+    assert "safety.confirm_skills" in plans.approval(replace(record, submitter="rover_1"), plan)
+    assert plans.approval(replace(record, submitter="ann"), plan) == ""
     harmless = plane.plan_of(Subtask(id="s1", skill="hold", robot="rover_1"))
-    assert manager.approval(replace(record, submitter="rover_1"), harmless) == ""
+    assert plans.approval(replace(record, submitter="rover_1"), harmless) == ""
