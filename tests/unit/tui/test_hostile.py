@@ -53,6 +53,8 @@ HOSTILE = (
     "\ud800 lone",
     "",
 )
+QUICKLY = {1, 3, 4, 8}
+"""Those that are enough for quick feedback: commands to the terminal, directions, wide characters, half a character."""
 TEXTS = st.one_of(st.sampled_from(HOSTILE), st.text(max_size=80))
 
 
@@ -171,7 +173,13 @@ def test_what_is_to_be_read_is_harmless(text: str, width: int) -> None:
     assert harmless(found.plain)
 
 
-@pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(text, id=str(number), marks=() if number in QUICKLY else pytest.mark.thorough)
+        for number, text in enumerate(HOSTILE)
+    ],
+)
 async def test_screens_live_with_it(view: "FakeView", text: str) -> None:
     """On every screen of the whole UI no control character reaches the terminal, and the screens go on."""
     store = view.store

@@ -1,5 +1,6 @@
 """A task whole, and a plan under review, under Textual's pilot on a fake fleet."""
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from appliance.model import Decision, Plan, Proposal, Subtask, TaskRecord, TaskS
 from appliance.tasks.steering.api import PlanChecked
 from appliance.tasks.watch.lines import Line, LineKind
 from appliance.tui.app import SwiftbotApp
+from appliance.tui.grid import Grid
 from appliance.tui.settings import TuiConfig
 from appliance.tui.tasks.graph import TaskScreen
 from appliance.tui.tasks.review import ReviewScreen
@@ -38,7 +40,8 @@ WAITING = TaskRecord(
 async def until(app: SwiftbotApp, pilot: Pilot[None], *wanted: str | Callable[[], bool]) -> str:
     """Wait until all that is wanted is on the screen, or true; fails with what is there."""
     text = ""
-    for _ in range(500):
+    until_s = time.monotonic() + 60
+    while time.monotonic() < until_s:
         await pilot.pause(0.02)
         app.draw()
         strips = app.screen._compositor.render_strips()
@@ -114,7 +117,9 @@ async def test_order_is_edited_and_taken_back(view: "FakeView") -> None:
             return [(each.id, each.after) for each in screen.draft.subtasks] if screen.draft is not None else []
 
         proposed = order()
-        await pilot.press("down", "o")
+        await pilot.press("down")
+        await until(app, pilot, lambda: screen.query_one("#steps", Grid).selected == "s2")
+        await pilot.press("o")
         await until(app, pilot, "edit-after s2 s1")
         await pilot.press("backspace", "backspace", "minus", "enter")
         await until(app, pilot, "after: s1 → nothing", "✔ checked: it may run")
