@@ -31,6 +31,8 @@ from podman.errors import APIError, ImageNotFound, PodmanError
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 
 T = TypeVar("T")
+RUNTIME_DIRS = Path("/run/user")
+"""Where systemd puts the runtime directories of users who are logged in or linger."""
 BUILD_REMEDY = "swiftbot images build"
 RUNC_REMEDY = (
     'crun wants cgroup v2: put runtime = "runc" under [engine] in ~/.config/containers/containers.conf of the'
@@ -145,21 +147,24 @@ class Engine(Protocol):
 def socket_path(url: str = "") -> Path:
     """Return the API socket's path: of `url`, or the user's own.
 
+    Where XDG_RUNTIME_DIR is not set it is looked for where systemd puts it, which may come while this process runs.
+
     Raises:
-        PrerequisiteError: the url is no unix one, or none is given and XDG_RUNTIME_DIR is not set.
+        PrerequisiteError: the url is no unix one, or none is given and the user has no runtime directory (yet).
     """
     if url:
         scheme, _, path = url.partition("://")
         if scheme not in ("unix", "http+unix") or not path.startswith("/"):
             raise PrerequisiteError(f"podman_url {url!r} is no socket", remedy="write it as unix:///path/podman.sock")
         return Path(path)
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if not runtime:
+    named = os.environ.get("XDG_RUNTIME_DIR")
+    runtime = Path(named) if named else RUNTIME_DIRS / str(os.getuid())
+    if not named and not runtime.is_dir():
         raise PrerequisiteError(
-            "XDG_RUNTIME_DIR is not set, so Podman's API socket cannot be found",
+            f"XDG_RUNTIME_DIR is not set and {runtime} is not there, so Podman's API socket cannot be found",
             remedy="run as the service user with lingering (loginctl enable-linger), or set pool.podman_url",
         )
-    return Path(runtime) / "podman" / "podman.sock"
+    return runtime / "podman" / "podman.sock"
 
 
 class PodmanEngine:

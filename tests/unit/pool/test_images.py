@@ -1,11 +1,12 @@
 """Where images are made from, and what their names depend on."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from appliance.errors import NotFoundError, PrerequisiteError
-from appliance.pool import images, sources
+from appliance.pool import engine, images, sources
 from appliance.pool.engine import ContainerSpec, PodmanEngine, create_arguments, socket_path
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue, load_catalogue
@@ -108,7 +109,7 @@ async def test_unknown_image(catalogue: Catalogue) -> None:
         await images.build("nonsense", catalogue)
 
 
-def test_socket_path(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_socket_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The API socket is the configured one, or the user's; where neither can be known, that is said."""
     assert socket_path("unix:///run/x.sock") == Path("/run/x.sock")
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/7")
@@ -117,8 +118,11 @@ def test_socket_path(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(PrerequisiteError, match="podman_url"):
             socket_path(url)
     monkeypatch.delenv("XDG_RUNTIME_DIR")
+    monkeypatch.setattr(engine, "RUNTIME_DIRS", tmp_path)
     with pytest.raises(PrerequisiteError, match="XDG_RUNTIME_DIR"):
         PodmanEngine()
+    (tmp_path / str(os.getuid())).mkdir()
+    assert socket_path() == tmp_path / str(os.getuid()) / "podman" / "podman.sock"
 
 
 def test_containers_are_hardened() -> None:
