@@ -34,7 +34,7 @@ check: ready ## The fast part: lint, types, import contracts, unit tests but the
 	$(MAKE) --no-print-directory lint formatted contracts READY=1
 	report=$$(mktemp); trap 'rm -f "$$report"' EXIT; failed=0; \
 	$(RUN) basedpyright --level error >"$$report" 2>&1 & types=$$!; \
-	SWIFTBOT_QUICK=1 $(PYTEST) --numprocesses 4 tests/unit || failed=$$?; \
+	SWIFTBOT_QUICK=1 $(PYTEST) --numprocesses 3 --dist worksteal tests/unit || failed=$$?; \
 	wait "$$types" || { cat "$$report" >&2; failed=1; }; \
 	exit "$$failed"
 
@@ -86,5 +86,5 @@ uninstall: ## Take the services out again (PURGE=1: data too)
 	DESTDIR="$(DESTDIR)" PURGE="$(PURGE)" scripts/uninstall.sh
 
 clean: ## Remove what builds and tests left in this tree
-	rm -rf dist .ruff_cache .hypothesis .import_linter_cache snapshot_report.html
+	rm -rf dist .ruff_cache .hypothesis .import_linter_cache
 	find . -path ./.venv -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf
