@@ -10,7 +10,7 @@ import structlog
 import zenoh
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError, UnreachableError
-from appliance.plane import link
+from appliance.plane import link, threads
 from appliance.plane.direct import Answer, Asked, Direct
 from appliance.plane.doors import Doors
 from appliance.plane.wire import Closer, Wire
@@ -104,7 +104,7 @@ class Answering:
                 group.add(task)
                 task.add_done_callback(group.discard)
 
-        queryable = self._wire.raw.declare_queryable(expr, zenoh.handlers.Callback(take, indirect=False), complete=True)
+        queryable = self._wire.raw.declare_queryable(expr, threads.callback(take), complete=True)
         messages = self._direct.serve(expr, take_direct) if direct else None
 
         def end() -> None:

@@ -13,7 +13,7 @@ import structlog
 import zenoh
 
 from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
-from appliance.plane import link
+from appliance.plane import link, threads
 from appliance.plane.direct import Direct
 from appliance.plane.doors import Doors
 from appliance.plane.publishing import Message
@@ -139,7 +139,7 @@ class Asking:
         send = partial(
             self._wire.raw.get,
             expr,
-            zenoh.handlers.Callback(take, drop=end, indirect=False),
+            threads.callback(take, drop=end),
             target=target,
             consolidation=zenoh.ConsolidationMode.NONE,
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.

@@ -14,6 +14,7 @@ matches, so that neither the recorder nor a listener to everything is sent them.
 
 import contextlib
 import secrets
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
@@ -22,13 +23,14 @@ from typing import NamedTuple
 import zenoh
 
 from appliance.errors import SwiftbotError
-from appliance.plane import link
+from appliance.plane import link, threads
 from appliance.plane.keys import DOOR
 from appliance.plane.wire import Closer, Wire
 
 Answer = Callable[[bytes | None, SwiftbotError | None], None]
 """Answers one question, from any thread; an empty answer has it asked again as a query."""
 
+_DROP, _HIGH = zenoh.CongestionControl.DROP, zenoh.Priority.DATA_HIGH
 _MOST_WAYS = 256
 _ANSWERED, _FAILED = b"+", b"-"
 _SESSION = frozenset(b"0123456789abcdef")
@@ -51,30 +53,52 @@ class _Waiting(NamedTuple):
 
 
 class Way:
-    """The way to one door: says whether anybody listens there."""
+    """The way to one door: says whether anybody listens there.
+
+    To look is slow. Zenoh tells of each change, one after the other: who is known to listen does so until it says
+    otherwise, or until a question stays unanswered (`doubt`); then it is looked again. Asked on the event loop's
+    thread, told on Zenoh's: what is told while it is looked is the newer.
+    """
 
     def __init__(self, raw: zenoh.Session, key: str, on_gone: Callable[["Way"], None]) -> None:
         self.key = key.encode()
+        self._listened, self._told = False, 0
+        self._lock = threading.Lock()
         self._publisher = raw.declare_publisher(
             f"{key}/{DOOR}",
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_HIGH,
+            congestion_control=_DROP,
+            priority=_HIGH,
             express=True,
         )
         self.put = self._publisher.put
         self._on_gone = on_gone
-        handler = zenoh.handlers.Callback(self._changed, indirect=False)
+        handler = threads.callback(self._changed)
         self._listener = self._publisher.declare_matching_listener(handler)
 
     def _changed(self, status: "zenoh.MatchingStatus") -> None:
+        with self._lock:
+            # Before those who wait are told that nobody listens any more: who asks after that sees it here.
+            self._listened, self._told = status.matching, self._told + 1
         if not status.matching:
             self._on_gone(self)
+
+    def doubt(self) -> None:
+        """A question stayed unanswered: look before the next."""
+        with self._lock:
+            self._listened = False
 
     @property
     def open(self) -> bool:
         """Whether somebody listens there just now."""
+        if self._listened:
+            return True
+        told = self._told
         # The stubs take the status for a bool; it is a structure with one.
-        return self._publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
+        listened = self._publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
+        with self._lock:
+            if self._told == told:
+                self._listened = listened
+        return listened
 
     def close(self) -> None:
         """Forget the way."""
@@ -88,11 +112,13 @@ class Direct:
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
         self._session = str(wire.raw.zid())
+        self._session_text = self._session.encode()
         self._ways: OrderedDict[str, Way] = OrderedDict()
         self._waiting: dict[int, _Waiting] = {}
         # An answer that Zenoh delivers to the wrong session finds nobody who waits for such a number.
         self._number = secrets.randbits(62)
         self._listening: zenoh.Subscriber[None] | None = None
+        self._answers = wire.keys.answers("")
 
     # --- asking -----------------------------------------------------------------------------------------------
 
@@ -116,16 +142,21 @@ class Direct:
         # Before it is looked whether anybody listens: who goes after that look ends it.
         self._waiting[number] = _Waiting(way, on_reply, on_gone)
         if not way.open:
-            del self._waiting[number]
+            self._waiting.pop(number, None)
             return None
-        self._listen()
-        attached = b"%d %s %s" % (number, self._session.encode(), way.key)
-        link.quietly(partial(way.put, payload, attachment=attached), key)
+        if self._listening is None:
+            self._listen()
+        try:
+            way.put(payload, attachment=b"%d %s %s" % (number, self._session_text, way.key))
+        except zenoh.ZError as error:
+            link.not_sent(key, error)
         return number
 
     def forget(self, number: int) -> None:
         """Wait for an answer no more."""
-        self._waiting.pop(number, None)
+        waiting = self._waiting.pop(number, None)
+        if waiting is not None:
+            waiting.way.doubt()
 
     def _way(self, key: str) -> Way:
         while len(self._ways) >= _MOST_WAYS:
@@ -144,11 +175,12 @@ class Direct:
     def _listen(self) -> None:
         if self._listening is None:
             expr = self._wire.keys.answers(self._session)
-            handler = zenoh.handlers.Callback(self._take_answer, indirect=False)
+            handler = threads.callback(self._take_answer)
             self._listening = self._wire.raw.declare_subscriber(expr, handler)
 
     def _take_answer(self, sample: zenoh.Sample) -> None:
-        raw = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        attached = sample.attachment
+        raw = attached.to_bytes() if attached is not None else b""
         kind, number = raw[:1], raw[1:]
         waiting = self._waiting.pop(int(number), None) if number.isdigit() and len(number) < _LONGEST else None
         if waiting is None:
@@ -168,14 +200,15 @@ class Direct:
         name = f"malformed {self._wire.name(key)}/{DOOR}"
 
         def deliver(sample: zenoh.Sample) -> None:
-            asked = _read(sample.attachment.to_bytes()) if sample.attachment is not None else None
+            attached = sample.attachment
+            asked = _read(attached.to_bytes()) if attached is not None else None
             if asked is None:
                 refuse = partial(self._wire.refuse, name, reason="it does not say who asks what")
                 self._wire.inbox.post(refuse)
             else:
                 take(asked, sample.payload)
 
-        handler = zenoh.handlers.Callback(deliver, indirect=False)
+        handler = threads.callback(deliver)
         return Closer(self._wire.raw.declare_subscriber(f"{key}/{DOOR}", handler).undeclare)
 
     def answer(self, asked: Asked, answer: bytes | None, error: SwiftbotError | None) -> None:
@@ -184,15 +217,14 @@ class Direct:
             kind, body = _FAILED, link.error_body(error or SwiftbotError("no answer"))
         else:
             kind, body = _ANSWERED, b"" if len(answer) > link.MOST_DIRECT else answer
-        key = self._wire.keys.answers(asked.session)
         # The asking side may be gone, or this one closing: that is for whoever asks to find out.
         with contextlib.suppress(zenoh.ZError):
             self._wire.raw.put(
-                key,
+                self._answers + asked.session,
                 body,
                 attachment=b"%s%d" % (kind, asked.number),
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA_HIGH,
+                congestion_control=_DROP,
+                priority=_HIGH,
                 express=True,
             )
 

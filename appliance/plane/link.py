@@ -104,7 +104,12 @@ def quietly(send: Callable[[], None], key: str) -> None:
     try:
         send()
     except zenoh.ZError as error:
-        log.warning("not sent", key=key, reason=str(error))
+        not_sent(key, error)
+
+
+def not_sent(key: str, error: zenoh.ZError) -> None:
+    """Log that something could not be sent."""
+    log.warning("not sent", key=key, reason=str(error))
 
 
 def error_of(error: zenoh.ReplyError | None) -> SwiftbotError:

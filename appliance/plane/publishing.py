@@ -11,6 +11,7 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
+from appliance.plane import threads
 from appliance.plane.flood import Flood
 from appliance.plane.wire import Closer, Wire
 
@@ -74,7 +75,7 @@ class Publishing:
             if not closer.closed:
                 callback(message)
 
-        subscriber = self._wire.raw.declare_subscriber(expr, zenoh.handlers.Callback(take, indirect=False))
+        subscriber = self._wire.raw.declare_subscriber(expr, threads.callback(take))
         closer = Closer(subscriber.undeclare)
         return closer
 

@@ -97,7 +97,10 @@ class Ring:
 
     def owner(self, key: str) -> str:
         """The gateway a key belongs to: the first point at or after the key's; UnreachableError on an empty ring."""
-        return self.successors(key, 1)[0]
+        if not self.points:
+            return self.successors(key, 1)[0]
+        at = bisect_left(self.points, position(key))
+        return self.names[at if at < len(self.names) else 0]
 
     def successors(self, key: str, n: int) -> tuple[str, ...]:
         """The first `n` different gateways from the key's position on, its owner first; fewer on a smaller ring."""

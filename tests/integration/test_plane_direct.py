@@ -4,6 +4,7 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -174,6 +175,68 @@ async def test_whoever_goes_ends_what_waits_for_it(pair: tuple[Session, Session]
     assert not one._asking._direct._waiting
     with pytest.raises(UnreachableError):
         await one.query(KEY, b"x", timeout_s=60, direct=True)
+
+
+async def test_whoever_is_known_to_listen_is_looked_for_again_in_doubt(pair: tuple[Session, Session]) -> None:
+    """Nobody is looked for before each question; a notice that never came costs one question its time, not each."""
+    one, other = pair
+    go = asyncio.Event()
+
+    async def handle(key: str, payload: bytes) -> bytes:
+        await go.wait()
+        return payload
+
+    closer = other.serve(KEY, handle, direct=True)
+    door = _Door(other)
+    go.set()
+    await door.known(one)
+    way = one._asking._direct._ways[KEY]
+    assert await one.query(KEY, b"x", timeout_s=5, direct=True) == b"x"
+    assert way._listened
+    go.clear()
+    with pytest.raises(DeadlineError):
+        await one.query(KEY, b"late", timeout_s=0.05, direct=True)
+    assert not way._listened
+    go.set()
+    assert await one.query(KEY, b"y", timeout_s=5, direct=True) == b"y"
+    assert way._listened
+    closer.close()
+    door._subscriber.undeclare()
+    await _until(lambda: not way.open)
+    assert not way._listened
+    way._listened = True
+    with pytest.raises(DeadlineError):
+        await one.query(KEY, b"x", timeout_s=0.05, direct=True)
+    with pytest.raises(UnreachableError) as nobody:
+        await one.query(KEY, b"x", timeout_s=60, direct=True)
+    assert not nobody.value.sent
+
+
+async def test_what_is_told_while_it_is_looked_is_the_newer(
+    pair: tuple[Session, Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look that ends after the notice that nobody listens any more leaves nothing behind that says otherwise."""
+    one, other = pair
+    other.serve(KEY, _echo, direct=True)
+    await _Door(other).known(one)
+    way = one._asking._direct._ways[KEY]
+    gone = SimpleNamespace(matching=False)
+
+    class Slow:
+        """A publisher whose look is overtaken by a notice."""
+
+        @property
+        def matching_status(self) -> SimpleNamespace:
+            way._changed(gone)  # pyright: ignore[reportArgumentType]
+            return SimpleNamespace(matching=True)
+
+    way.doubt()
+    with monkeypatch.context() as patched:
+        patched.setattr(way, "_publisher", Slow())
+        assert way.open
+        assert not way._listened
+    assert way.open
+    assert way._listened
 
 
 async def test_a_message_at_the_wrong_door_is_asked_again(pair: tuple[Session, Session]) -> None:

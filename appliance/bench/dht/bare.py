@@ -20,7 +20,7 @@ import zenoh
 
 from appliance.bench.dht.node import tell
 from appliance.local_fleet import free_port
-from appliance.plane import link
+from appliance.plane import link, threads
 from appliance.plane.settings import PlaneConfig
 
 ANSWER_S = 10.0
@@ -47,7 +47,7 @@ async def _ask(session: zenoh.Session, key: str, payload: bytes) -> None:
 
     session.get(
         key,
-        zenoh.handlers.Callback(take, indirect=False),
+        threads.callback(take),
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=ANSWER_S,
         congestion_control=zenoh.CongestionControl.DROP,
@@ -70,7 +70,7 @@ async def serve(nodes: int) -> None:
     answering = [
         each.declare_queryable(
             f"bare/{number}",
-            zenoh.handlers.Callback(partial(_answer, f"bare/{number}"), indirect=False),
+            threads.callback(partial(_answer, f"bare/{number}")),
             complete=True,
         )
         for number, each in enumerate(sessions)
