@@ -101,7 +101,7 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     floor_confidence: float = 0.1
     """A valid plan that no tier was sure enough of is still taken, when nothing better came, down to this; below
     `safety.confirm_below` it waits for an operator, to whom a draft is more use than nothing. Of the embedded planner's
-    plans with 0.1 to 0.3 a fifth is right, of those below one in fifteen."""
+    plans with 0.1 to 0.3 a quarter is right, of those below one in fifteen."""
     repair: bool = True
     """Ask a model once more, with the validator's problems, when its plan is not valid."""
     require_implemented: bool = True
