@@ -5,7 +5,8 @@ process a side has one event loop for all its nodes; with a process for each, as
 another process. They do not promise the same: a put here is a compare-and-set ordered by the key's owner
 and synced to the disks of three gateways before it is acknowledged, where kademlia's last writer wins in memory and
 nothing is ever on a disk. So that the same work is compared too, `put_unsynced` is ours without syncing, and
-`kademlia_durable` the package with a storage that has a value on the disk before it answers. `zenoh_alone` is a
+`kademlia_durable` the package with a storage that has a value on the disk before it answers; a get asks the owner here
+and takes any copy there, so `get_any_copy` is one that takes the first copy here too. `zenoh_alone` is a
 question and its answer between as many sessions of one process, with no code of ours (`bare`).
 """
 
@@ -65,10 +66,10 @@ async def run(
     """Measure `count` puts and gets on both sides.
 
     Returns:
-        `swiftbot`, `kademlia`, `kademlia_durable` and, in one process, `zenoh_alone`: what each did of `put`, `get` and
-        `put_unsynced`, each count, p50, p90, p99 and max in ms; `cpu_ms_each` (one process), processor time of an
-        operation, which other work on the machine changes less. The ratios of the medians and of p99. `kademlia` is
-        `missing`, with how to install it, where it is not there.
+        `swiftbot`, `kademlia`, `kademlia_durable` and, in one process, `zenoh_alone`: what each did of `put`, `get`,
+        `get_any_copy` and `put_unsynced`, each count, p50, p90, p99 and max in ms; `cpu_ms_each` (one process),
+        processor time of an operation, which other work on the machine changes less. The ratios of the medians and of
+        p99. `kademlia` is `missing`, with how to install it, where it is not there.
 
     Raises:
         SwiftbotError: a side could not be started, or a gateway has not what was put.
@@ -78,7 +79,7 @@ async def run(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="swiftbot-bench-")))
         progress(f"{nodes} gateways on loopback, {layout}")
         sides: dict[str, Side] = {"swiftbot": await _our_side(stack, nodes, folder, layout)}
-        ops: dict[str, tuple[str, ...]] = {"swiftbot": ("put", "get", "put_unsynced")}
+        ops: dict[str, tuple[str, ...]] = {"swiftbot": ("put", "get", "get_any_copy", "put_unsynced")}
         result: dict[str, Any] = {"nodes": nodes, "layout": layout, "value_bytes": len(_VALUE)}
         if layout == "one process":
             progress(f"{nodes} sessions of Zenoh alone")
@@ -96,7 +97,7 @@ async def run(
         times: dict[str, dict[str, list[float]]] = {name: {what: [] for what in ops[name]} for name in sides}
         for block in range(-(-count // _BLOCK)):
             progress(f"{min(count, (block + 1) * _BLOCK)} of {count}")
-            for what in ("put", "get", "put_unsynced"):
+            for what in ("put", "get", "get_any_copy", "put_unsynced"):
                 suffix = "-u" if what == "put_unsynced" else ""
                 keys = [f"bench/{block}-{number}{suffix}" for number in range(_BLOCK)]
                 for name, side in sides.items():
@@ -111,6 +112,7 @@ async def run(
             for name, theirs, ours in (
                 ("put", figures["kademlia"]["put"], figures["swiftbot"]["put"]),
                 ("get", figures["kademlia"]["get"], figures["swiftbot"]["get"]),
+                ("get_both_any_copy", figures["kademlia"]["get"], figures["swiftbot"]["get_any_copy"]),
                 ("put_both_unsynced", figures["kademlia"]["put"], figures["swiftbot"]["put_unsynced"]),
                 ("put_both_synced", figures["kademlia_durable"]["put"], figures["swiftbot"]["put"]),
             )

@@ -43,8 +43,8 @@ async def do(dht: Dht, command: dict[str, Any]) -> dict[str, Any]:
     failed, cpu = 0, time.process_time()
     for key in command["keys"]:
         began = time.perf_counter()
-        if op == "get":
-            found = await dht.read(key) is not None
+        if op in ("get", "get_any_copy"):
+            found = await dht.read(key, replica=op == "get_any_copy") is not None
         else:
             found = bool(await dht.write(key, value, expected=None, durable=op == "put"))
         times.append((time.perf_counter() - began) * 1e3)
