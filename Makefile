@@ -34,7 +34,7 @@ check: ready ## The fast part: lint, types, import contracts, unit tests but the
 	$(MAKE) --no-print-directory lint formatted contracts READY=1
 	report=$$(mktemp); trap 'rm -f "$$report"' EXIT; failed=0; \
 	$(RUN) basedpyright --level error >"$$report" 2>&1 & types=$$!; \
-	SWIFTBOT_QUICK=1 $(PYTEST) --numprocesses 3 --dist worksteal tests/unit || failed=$$?; \
+	SWIFTBOT_QUICK=1 $(PYTEST) --numprocesses 6 --dist worksteal tests/unit || failed=$$?; \
 	wait "$$types" || { cat "$$report" >&2; failed=1; }; \
 	exit "$$failed"
 
