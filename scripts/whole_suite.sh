@@ -18,6 +18,10 @@ status=0
 suite "$@" || status=$?
 # 1: tests failed; anything else is a run that did not come to its end.
 [ "$status" = 1 ] || exit "$status"
+run test -e "$memory/v/cache/lastfailed" || {
+    echo 'The run was ended by a test that stood still: the stacks above say where.' >&2
+    exit 1
+}
 printf '\nThese failed and are run once more, by themselves:\n'
 run cat "$memory/v/cache/lastfailed"
 printf '\n'
