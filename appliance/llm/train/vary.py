@@ -17,10 +17,9 @@ from appliance.llm.language import values
 from appliance.llm.language.codec import ANY
 from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
 from appliance.llm.train.lexicon import Lexicon
+from appliance.llm.train.linking import MAX_WORDS, joined, robots_of
 from appliance.llm.train.reword import reworded
 
-MAX_WORDS = 160
-MAX_SUBTASKS = 14
 _NUMERIC = frozenset({"laps", "count", "epochs", "fps"})
 _MARK = re.compile(r"[^\w\s]+")
 _NUMBER_WORDS = (
@@ -48,10 +47,6 @@ _WHOEVER = frozenset(
     {"robot", "robots", "drone", "drones", "bot", "bots", "unit", "units", "machine", "machines", "arm", "arms"}
     | {"somebody", "someone", "anyone", "anybody", "whoever", "whichever", "everyone", "everybody", "another", "other"}
     | {"whoever's", "either", "each", "nearest", "closest", "free", "idle"}
-)
-_LEADS = frozenset(
-    {"then", "after", "afterwards", "next", "finally", "and", "once", "when", "meanwhile"}
-    | {"while", "or", "but", "also", "later", "before", "first", "if"}
 )
 
 
@@ -140,7 +135,7 @@ def _movable(found: Sequence[Span], first: int, last: int) -> bool:
 
 def addressed(example: Example, lexicon: Lexicon, rng: random.Random) -> Example:
     """Return an order to whomever as one to a robot that is called by its name first: all of it is that robot's."""
-    if example.symbols[0] == "none" or len(example.words) > example.own or _robots(example) != {"any"}:
+    if example.symbols[0] == "none" or len(example.words) > example.own or robots_of(example) != {"any"}:
         return example
     if _WHOEVER & set(example.words):
         return example  # it speaks of a robot that is none in particular
@@ -154,102 +149,6 @@ def addressed(example: Example, lexicon: Lexicon, rng: random.Random) -> Example
     pointer = (f"w{first}", f"w{first + len(name) - 1}")
     symbols = [word for each in made.symbols for word in (pointer if each == "any" else (each,))]
     return replace(made, symbols=tuple(symbols))
-
-
-# --- two as one ----------------------------------------------------------------------------------------------------
-
-
-def joined(one: Example, two: Example, rng: random.Random) -> Example | None:
-    """Return two instructions as one, in order or side by side; None where that would not be clear."""
-    if "none" in (one.symbols[0], two.symbols[0]) or len(one.words) > one.own or len(two.words) > two.own:
-        return None
-    if two.words[0] in _LEADS or len(one.words) + len(two.words) > MAX_WORDS:
-        return None
-    firsts, seconds = _robots(one), _robots(two)
-    if "all" in firsts | seconds or _count(one) + _count(two) > MAX_SUBTASKS:
-        return None
-    anys = {each for each in firsts | seconds if ANY.fullmatch(each)}
-    named = not anys
-    in_order = True
-    second = list(two.symbols)
-    if named and not firsts & seconds and firsts and seconds:
-        roll = rng.random()
-        in_order = roll < 0.4
-        link = rng.choice(_PHRASES["then"] if in_order else _PHRASES["meanwhile"] if roll < 0.7 else _PHRASES["beside"])
-        if in_order and len(_lasts(one.symbols)) > 1:
-            link = rng.choice(_PHRASES["joining"])
-    elif anys == {"any"} and firsts in ({"any"}, set()) and seconds in ({"any"}, set()):
-        link = rng.choice(_PHRASES["then"])
-    elif len(firsts) == 1 and not anys & firsts and seconds == {"any"} and "robots:" not in one.symbols:
-        # A robot named once: what follows without a name is its own.
-        robot = next(span for span in spans(one) if span.role == ROBOT)
-        if not robot.alone:
-            return None
-        link = rng.choice(_PHRASES["then"])
-        second = _with_robot(second, (f"w{robot.first}", f"w{robot.last}"))
-    else:
-        return None
-    return _linked(one, two, second, link, in_order=in_order)
-
-
-def _linked(one: Example, two: Example, second: Sequence[str], link: str, *, in_order: bool) -> Example:
-    first_words = list(one.words)
-    while first_words and _MARK.fullmatch(first_words[-1]) and len(first_words) - 1 not in pointed(one):
-        first_words.pop()
-    words = (*first_words, *link.split(), *two.words)
-    shift, count = len(words) - len(two.words), _count(one)
-    lasts = [str(each) for each in _lasts(one.symbols)]
-    symbols = list(one.symbols)
-    for part in _subtasks(second[1:]):
-        body, after = (part[: part.index("<")], part[part.index("<") + 1 :]) if "<" in part else (part, [])
-        before = [str(int(each) + count) for each in after] or (lasts if in_order else [])
-        symbols += ["|", *(_shifted(each, shift) for each in body), *(["<", *before] if before else [])]
-    longer = _count(two) >= count
-    return Example(words, len(words), (second[0] if longer else symbols[0], *symbols[1:]))
-
-
-def _shifted(symbol: str, by: int) -> str:
-    if symbol.startswith("="):
-        return symbol[1:]
-    return f"w{int(symbol[1:]) + by}" if re.fullmatch(r"w\d+", symbol) else symbol
-
-
-def _with_robot(symbols: Sequence[str], pointer: Sequence[str]) -> list[str]:
-    """Return symbols with `any` replaced by a pointer that is not to be moved (marked with =)."""
-    made: list[str] = []
-    for each in symbols:
-        made += [f"={word}" for word in pointer] if each == "any" else [each]
-    return made
-
-
-def _subtasks(symbols: Sequence[str]) -> list[list[str]]:
-    parts: list[list[str]] = [[]]
-    for each in symbols:
-        if each == "|":
-            parts.append([])
-        else:
-            parts[-1].append(each)
-    return parts
-
-
-def _count(example: Example) -> int:
-    return 1 + example.symbols.count("|")
-
-
-def _lasts(symbols: Sequence[str]) -> list[int]:
-    """Return the numbers of the subtasks after which none comes."""
-    parts = _subtasks(symbols[1:])
-    before = {int(each) for part in parts if "<" in part for each in part[part.index("<") + 1 :]}
-    return [number for number in range(1, len(parts) + 1) if number not in before]
-
-
-def _robots(example: Example) -> set[str]:
-    """Return the robots of a plan, as ids; `any`, `all` and the like as they are."""
-    found = {each for each in example.symbols if ANY.fullmatch(each)}
-    for span in spans(example):
-        if span.role == ROBOT:
-            found.add(values.robot(" ".join(example.words[span.first : span.last + 1])) + ("" if span.alone else "+"))
-    return found
 
 
 # --- marks, fillers, slips -----------------------------------------------------------------------------------------
@@ -347,7 +246,7 @@ def articles(example: Example, rng: random.Random) -> Example:
 
 def rostered(example: Example, rng: random.Random) -> Example:
     """Return an example with a roster that has its robots and others, or without one."""
-    robots = _robots(example)
+    robots = robots_of(example)
     if any(span.first >= example.own for span in spans(example)) or "all" in robots:
         return example
     if len(example.words) > example.own:

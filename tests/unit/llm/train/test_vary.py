@@ -13,7 +13,7 @@ from appliance.llm.train.examples import Example, example_of, is_exact, substitu
 from appliance.llm.train.lexicon import Lexicon, syllables
 from appliance.llm.train.splits import names, shape, split
 from appliance.llm.train.tokens import Tokens
-from appliance.llm.train.vary import addressed, joined, numbered, renamed, rostered, unmarked, vary
+from appliance.llm.train.vary import addressed, numbered, renamed, rostered, unmarked, vary
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
 
@@ -86,45 +86,6 @@ def test_whom_an_order_is_put_to_has_all_of_it(lexicon: Lexicon, seed: int) -> N
         example("Hm .", "none chatter"),
     ):
         assert addressed(other, lexicon, chance(seed)) == other
-
-
-def test_what_follows_two_side_by_side_waits_for_both() -> None:
-    """A third instruction that is joined in order to two of different robots comes after the last subtask of each."""
-    for seed in range(400):
-        both = joined(FETCH, FILM, chance(seed))
-        assert both is not None
-        if "< 2" in " ".join(both.symbols):
-            continue  # one after the other
-        third = example("Lou , open the gate .", "manipulation open w0 w0 object: w4 w4")
-        all_three = joined(both, third, chance(seed + 1))
-        if all_three is not None and all_three.symbols[-3:-1] == ("<", "2"):
-            assert plan(all_three)[-1].after == ("s2", "s3")
-            return
-    raise AssertionError("never in order")
-
-
-def test_two_instructions_as_one() -> None:
-    """In order every first comes after every last; side by side nothing does; a robot named once does what follows."""
-    seen: set[tuple[str, ...]] = set()
-    for seed in range(60):
-        made = joined(FETCH, FILM, chance(seed))
-        assert made is not None
-        seen.add(plan(made)[2].after)
-    assert seen == {("s2",), ()}
-    unnamed = example("film the gate", "perception record_video any target: w2 w2")
-    made = joined(FETCH, unnamed, chance(1))
-    assert made is not None
-    assert plan(made)[2].robot == "rex"
-    assert plan(made)[2].after == ("s2",)
-
-
-def test_what_would_not_be_clear_is_not_joined() -> None:
-    """Groups, refusals and robots of both without an order stay apart."""
-    group = example("both drones land", "navigation land all")
-    refused = Example(("what", "is", "love"), 3, ("none", "question"))
-    assert joined(FETCH, group, chance(1)) is None
-    assert joined(FETCH, refused, chance(1)) is None
-    assert joined(refused, FETCH, chance(1)) is None
 
 
 def test_marks_numbers_and_rosters() -> None:
