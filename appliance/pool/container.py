@@ -218,7 +218,12 @@ class PooledContainer:
         return bool((await self._ask({"op": "save", "run": run_id}, CONTROL_TIMEOUT_S)).get("ok"))
 
     async def begin(self, order: Frame) -> Connection:
-        """Send a run on the spare connection and return it; UnreachableError when the runner is gone."""
+        """Send a run on the spare connection and return it.
+
+        Raises:
+            UnreachableError: the runner is gone.
+            PayloadError: the order cannot be sent; nothing of it was, and the connection is kept for the next.
+        """
         connection, self._spare = self._spare, None
         try:
             if connection is None:
@@ -227,6 +232,9 @@ class PooledContainer:
             await connection.send(order)
         except OSError as error:
             raise UnreachableError(f"the runner of {self.id} is gone") from error
+        except PayloadError:
+            self._spare = connection
+            raise
         return connection
 
     async def _open(self) -> Connection:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import structlog
 from msgspec import Struct
 from msgspec.structs import replace
@@ -228,18 +229,14 @@ class Starter:
             reason = "not running"
         elif not name or image not in self._catalogue.images:
             reason = "not of this catalogue"
+        elif (size := _read_size(found)) is None:
+            reason = "its label does not say what it was given"
         else:
             container = self.new(image)
             container.folder = self._run_dir / Path(name).name
             container.engine_id = found.id
-            size = json.loads(found.labels.get(LABEL_SIZE, "{}"))
-            container.mounts = tuple(str(each) for each in size.get("volumes", ()))
-            container.info = replace(
-                container.info,
-                id=name,
-                cpu=float(size.get("cpu", container.info.cpu)),
-                memory_mb=int(size.get("memory_mb", container.info.memory_mb)),
-            )
+            container.mounts = size.volumes
+            container.info = replace(container.info, id=name, cpu=size.cpu, memory_mb=size.memory_mb)
             self.look_at_state(container)
             if found.labels.get(LABEL_STATE) != self._made(image):
                 reason = "made of another image, runner or handlers"
@@ -323,12 +320,12 @@ class Starter:
         processes = 0 if facts.limits_enforced else config.user_processes
         inside = "/run/swiftbot"
         command = ("python3", "-s", "-m", "runner.main", "--socket", f"{inside}/{SOCKET}", "--spec", f"{inside}/{SPEC}")
-        size = {"cpu": info.cpu, "memory_mb": info.memory_mb, "volumes": container.mounts}
+        size = Size(cpu=info.cpu, memory_mb=info.memory_mb, volumes=container.mounts)
         labels = {
             LABEL_ID: info.id,
             LABEL_IMAGE: info.image,
             LABEL_STATE: self._made(info.image),
-            LABEL_SIZE: json.dumps(size),
+            LABEL_SIZE: msgspec.json.encode(size).decode(),
         }
         return ContainerSpec(
             name=f"swiftbot-{self._fleet}-{self._gateway}-{info.id}",
@@ -354,6 +351,14 @@ class Starter:
             seccomp_profile=config.seccomp_profile,
             limits=facts.limits_enforced,
         )
+
+
+def _read_size(found: Found) -> Size | None:
+    """Return what a container was given, by its label; None where that says nothing of the kind."""
+    try:
+        return msgspec.json.decode(found.labels.get(LABEL_SIZE, ""), type=Size)
+    except msgspec.DecodeError:
+        return None
 
 
 def _write(folder: Path, runner: dict[str, Any]) -> None:

@@ -168,14 +168,15 @@ async def test_adoption_after_a_kill_in_mid_run(bench: Any, tmp_path: Path) -> N
 
 
 async def test_what_cannot_be_adopted_is_removed(bench: Any) -> None:
-    """A container that has ended, or was made of other code, is removed and not adopted."""
-    before = await bench.pool(floor={"base": 3})
-    await bench.ready(before, 3)
+    """A container that has ended, was made of other code, or whose labels make no sense is removed and not adopted."""
+    before = await bench.pool(floor={"base": 5})
+    await bench.ready(before, 5)
     await before.stop(keep_containers=True)
-    first, second, _ = bench.engine.specs
+    first, second, third, fourth, _ = bench.engine.specs
     await bench.engine.kill(first)
-    spec = bench.engine.specs[second]
-    spec.labels["swiftbot.made"] = "of something else"
+    bench.engine.specs[second].labels["swiftbot.made"] = "of something else"
+    bench.engine.specs[third].labels["swiftbot.size"] = "large"
+    bench.engine.specs[fourth].labels["swiftbot.size"] = '{"cpu": "all", "memory_mb": []}'
     after = await bench.pool()
     assert len(after.containers()) == 1
     assert len(bench.engine.specs) == 1
