@@ -90,7 +90,8 @@ def _waiting(one: Example, two: Example, rng: random.Random) -> _Link | None:
     awaited = rng.sample(doers, 2) if len(doers) > 1 and rng.random() < 0.25 else [rng.choice(doers)]
     numbers = {number for each in awaited for number in each.subtasks}
     numbers -= {early for number in numbers for early in before[number]}
-    names = dict(zip(("NAME", "OTHER"), (" ".join(each.name) for each in awaited), strict=False))
+    stands_for = zip(["NAME", "OTHER"], (" ".join(each.name) for each in awaited), strict=False)
+    names: dict[str, str] = dict(stands_for)
 
     def choose(of: str) -> str:
         words = rng.choice(_PHRASES[of if len(awaited) == 1 else f"{of}_two"]).split()
