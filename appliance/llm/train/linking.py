@@ -134,9 +134,9 @@ def _doers(example: Example) -> Iterator[_Doer]:
 
 
 def _linked(one: Example, two: Example, second: Sequence[str], link: _Link) -> Example:
-    first_words, second_words = _unended(one), list(two.words)
+    first_words, second_words = unended(one), list(two.words)
     if link.after:
-        second_words = [*_unended(two), *link.after.split()]
+        second_words = [*unended(two), *link.after.split()]
     words = (*first_words, *link.between.split(), *second_words)
     shift = len(first_words) + len(link.between.split())
     firsts = _subtasks(one.symbols[1:])
@@ -150,8 +150,8 @@ def _linked(one: Example, two: Example, second: Sequence[str], link: _Link) -> E
     return Example(words, len(words), (domain, *symbols[1:]))
 
 
-def _unended(example: Example) -> list[str]:
-    """Return the words without the marks at the end."""
+def unended(example: Example) -> list[str]:
+    """Return the words of an example without a roster, without the marks at the end."""
     words, kept = list(example.words), pointed(example)
     while words and _MARK.fullmatch(words[-1]) and len(words) - 1 not in kept:
         words.pop()
@@ -213,6 +213,11 @@ def _ancestors(symbols: Sequence[str]) -> dict[int, set[int]]:
         after = _cut(part)[1]
         found[number] = set(after).union(*(found[each] for each in after))
     return found
+
+
+def subtasks_of(example: Example) -> list[tuple[list[str], list[int]]]:
+    """Return the symbols of each subtask of a plan, with the numbers of those it comes after."""
+    return [_cut(part) for part in _subtasks(example.symbols[1:])]
 
 
 def robots_of(example: Example) -> set[str]:

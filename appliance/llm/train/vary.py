@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from appliance.llm.language import values
 from appliance.llm.language.codec import ANY
+from appliance.llm.train.crews import crewed
 from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
 from appliance.llm.train.lexicon import Lexicon
 from appliance.llm.train.linking import MAX_WORDS, joined, robots_of
@@ -68,6 +69,8 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
         made = reworded(made, rng)
     if rng.random() < 0.8:
         made = renamed(made, lexicon, rng)
+    if rng.random() < 0.15:
+        made = crewed(made, lexicon, rng)
     for chance, change in _CHANGES:
         if rng.random() < chance:
             made = change(made, rng)
