@@ -13,6 +13,7 @@ from appliance.pool.pool import Call, Pool
 from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
+from appliance.pool.state import ALONE, State
 from appliance.skills.catalogue import Catalogue
 
 HANDLER = """
@@ -86,9 +87,15 @@ class Bench:
         self.pools: list[Pool] = []
 
     async def pool(
-        self, *, gateway: str = "g1", fleet: str = "", read_memory: Callable[[], Reading] | None = None, **settings: Any
+        self,
+        *,
+        gateway: str = "g1",
+        fleet: str = "",
+        read_memory: Callable[[], Reading] | None = None,
+        state: State = ALONE,
+        **settings: Any,
     ) -> Pool:
-        """Return a started pool; `read_memory` stands for what the kernel says of memory."""
+        """Return a started pool; `read_memory` is what the kernel says of memory, `state` where state comes from."""
 
         async def nobody(need: Need, avoid: Collection[str]) -> list[Candidate]:
             return []
@@ -108,6 +115,7 @@ class Bench:
             on_call=answer,
             on_change=lambda _: None,
             read_memory=read_memory,
+            state=state,
         )
         self.pools.append(pool)
         await pool.start()

@@ -269,6 +269,10 @@ async def test_a_fork_bomb(bench: Bench, pool: Pool) -> None:
         assert final.result is not None
         assert 0 < final.result["forked"] < MOST_FORKS
         assert "unavailable" in final.result["error"]
+    else:
+        assert final.failure is not None
+        assert final.failure.message
+        assert final.failure.remedy
     after = await _next_run_works(bench, pool)
     assert after.container == final.container
 

@@ -180,14 +180,15 @@ async def test_replaced_when_it_has_grown(bench: Bench) -> None:
 # --- an image that does not start ---------------------------------------------------------------------------------
 
 
-async def podman(*command: str, stdin: bytes = b"") -> None:
-    """Run the command `podman`."""
+async def podman(*command: str, stdin: bytes = b"") -> str:
+    """Run the command `podman` and return what it said."""
     process = await asyncio.create_subprocess_exec(
         "podman", *command,
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
     )  # fmt: skip
     told, _ = await process.communicate(stdin)
     assert process.returncode == 0, told.decode(errors="replace")
+    return told.decode().strip()
 
 
 async def test_an_image_that_keeps_failing_is_left_alone(bench: Bench) -> None:
@@ -207,6 +208,7 @@ async def test_an_image_that_keeps_failing_is_left_alone(bench: Bench) -> None:
     with tarfile.open(fileobj=empty, mode="w") as file:
         file.addfile(tarfile.TarInfo("nothing"))
     await podman("import", "-", mine, stdin=empty.getvalue())
+    broken = await podman("image", "inspect", "--format", "{{.Id}}", mine)
     try:
         pool = await bench.pool(floor={name: 1, "base": 1}, quarantine_s=3600.0)
         await until(lambda: f"3 starts of image {name} failed" in pool.problem, "it is left alone")
@@ -233,7 +235,7 @@ async def test_an_image_that_keeps_failing_is_left_alone(bench: Bench) -> None:
         await gone(bench, 2)
         await pool.stop(keep_containers=False)
     finally:
-        await podman("rmi", "--ignore", mine)
+        await podman("rmi", "--ignore", mine, broken)  # it has lost its name to the one that mends it
 
 
 # --- drain, and memory --------------------------------------------------------------------------------------------

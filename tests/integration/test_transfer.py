@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from transfer_bench import MIB, Side, Sides, fill, moved, same, sides, small_image, tree
+from transfer_bench import MIB, Side, Sides, fill, moved, podman_service, same, sides, small_image, tree
 
 from appliance.errors import CancelledByOperatorError, NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.plane.keys import Keys
@@ -344,25 +344,8 @@ async def test_many_ask_for_one_volume_at_once(pair: tuple[Side, Side]) -> None:
 @pytest.fixture
 async def second(folder: Path) -> AsyncIterator[str]:
     """A second Podman storage: the API socket's URL of a service of the test's own."""
-    place = folder.parent / "second"
-    place.mkdir()
-    options = ["--root", str(place / "root"), "--runroot", str(place / "run"), "--storage-driver", "overlay"]
-    process = await asyncio.create_subprocess_exec(
-        "podman", *options, "system", "service", "--time", "0", f"unix://{place}/podman.sock"
-    )
-    try:
-        async with asyncio.timeout(60):
-            while not (place / "podman.sock").exists():
-                assert process.returncode is None
-                await asyncio.sleep(0.05)
-        yield f"unix://{place}/podman.sock"
-    finally:
-        process.terminate()
-        await process.wait()
-        # Files of layers belong to the user's further ids, and the storage is mounted on itself.
-        sweep = f"umount -l {place}/root/overlay; rm -rf {place}"
-        remove = await asyncio.create_subprocess_exec("podman", "unshare", "sh", "-c", sweep)
-        await remove.wait()
+    async with podman_service(folder.parent / "second") as url:
+        yield url
 
 
 async def _load(storage: PodmanStorage, reference: str, layers: list[dict[str, bytes]]) -> str:
@@ -371,8 +354,8 @@ async def _load(storage: PodmanStorage, reference: str, layers: list[dict[str, b
     return image
 
 
-async def test_an_image_spreads_without_a_registry(fleet: Sides, second: str) -> None:
-    """A gateway with a storage of its own brings an image; the next one built on it brings only its own layer."""
+async def test_an_image_spreads_without_a_registry(fleet: Sides, second: str, folder: Path) -> None:
+    """Of an image only the layers that are missing come; who got it gives it on when the one it came from is gone."""
     one, other = await fleet.start(0), await fleet.start(1, podman=second)
     await fleet.settled()
     tag = f"localhost/{fleet.fleet}/image"
@@ -392,9 +375,19 @@ async def test_an_image_spreads_without_a_registry(fleet: Sides, second: str) ->
         assert (await other.transfers.bring_image(f"{tag}:2")).wire_bytes == 0
         assert f"{tag}:2" in other.transfers.images()
         assert not other.transfers.refused
+        await fleet.stop(0)
+        async with podman_service(folder.parent / "third") as url:
+            third = await fleet.start(2, podman=url)
+            await fleet.settled()
+            brought = await third.transfers.bring_image(f"{tag}:2")
+            assert brought.gateway == "g1"
+            assert (await third.storage.image(f"{tag}:2")).id == both
+            await fleet.stop(2)
     finally:
+        storage = PodmanStorage()
         for number in (2, 1):
-            await one.storage.remove_image(f"{tag}:{number}")
+            await storage.remove_image(f"{tag}:{number}")
+        storage.close()
 
 
 async def test_images_that_are_not_what_they_say(fleet: Sides, second: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -190,6 +190,29 @@ def fill(megabytes: int) -> Callable[[Path], None]:
     return write
 
 
+@contextlib.asynccontextmanager
+async def podman_service(place: Path) -> AsyncIterator[str]:
+    """A Podman with a storage of its own in a new folder, as another machine has; the URL of its API socket."""
+    place.mkdir()
+    options = ["--root", str(place / "root"), "--runroot", str(place / "run"), "--storage-driver", "overlay"]
+    process = await asyncio.create_subprocess_exec(
+        "podman", *options, "system", "service", "--time", "0", f"unix://{place}/podman.sock"
+    )
+    try:
+        async with asyncio.timeout(60):
+            while not (place / "podman.sock").exists():
+                assert process.returncode is None
+                await asyncio.sleep(0.05)
+        yield f"unix://{place}/podman.sock"
+    finally:
+        process.terminate()
+        await process.wait()
+        # Files of layers belong to the user's further ids, and the storage is mounted on itself.
+        sweep = f"umount -l {place}/root/overlay; rm -rf {place}"
+        remove = await asyncio.create_subprocess_exec("podman", "unshare", "sh", "-c", sweep)
+        await remove.wait()
+
+
 async def same(one: Side, other: Side, name: str) -> bool:
     """Whether a volume is the same at both."""
     return await asyncio.to_thread(tree, await one.folder(name)) == await asyncio.to_thread(
