@@ -19,6 +19,7 @@ from appliance.llm.train.crews import crewed
 from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
 from appliance.llm.train.lexicon import Lexicon
 from appliance.llm.train.linking import MAX_WORDS, joined, robots_of
+from appliance.llm.train.listing import listed
 from appliance.llm.train.reword import reworded
 
 _NUMERIC = frozenset({"laps", "count", "epochs", "fps"})
@@ -60,7 +61,8 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
         lexicon: nouns for other names.
         rng: of everything that is random.
     """
-    made = addressed(example, lexicon, rng) if rng.random() < 0.4 else example
+    made = listed(example, rng) if rng.random() < 0.2 else example
+    made = addressed(made, lexicon, rng) if rng.random() < 0.4 else made
     for chance in (0.4, 0.15):
         if others and rng.random() < chance:
             other = rng.choice(others)
