@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
-from appliance import console
 from appliance.cli.bench.common import Floats, Image, Ints, Words, bench_app, measure, say, tell
-from appliance.cli.common import Json, show
+from appliance.cli.common import Json
 from appliance.errors import Exit
 
 
@@ -197,7 +196,7 @@ def policy(
         gateways=tuple(each for each in gateways if each > 0),
         seed=seed,
         draws=draws,
-        progress=console.err.print,
+        progress=say,
     )
-    show(result, as_json=as_json, table=console.bench_table(result))
+    tell(result, as_json=as_json)
     return 0

@@ -1,7 +1,10 @@
 """The benchmark of pool policies: its comparisons are right, and a small one runs to the end."""
 
+from pathlib import Path
+
 import pytest
 
+from appliance import cli
 from appliance.bench.policy import (
     BY_NUMBER,
     DEFAULT,
@@ -18,6 +21,7 @@ from appliance.bench.policy import (
     run,
 )
 from appliance.errors import ConfigError
+from appliance.pool.simulator.recorded import write_trace
 from appliance.pool.simulator.traces import plain
 
 
@@ -60,6 +64,19 @@ def test_other_gateways_spare_cold_starts() -> None:
     stands = over_gateways((3,), seed=1, budget_mb=1024, duration_s=1800.0)["3"]
     assert stands["cold"]["cold_percent"] == 100.0
     assert stands["federated"]["cold_percent"] < 0.7 * stands["local"]["cold_percent"]
+
+
+def test_the_command_on_a_recorded_trace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever its file is called, it becomes a table of the policies with each budget."""
+    file = tmp_path / "[bold] name.jsonl"
+    write_trace(plain("poisson", rate=0.1, duration_s=600.0, images=2), file)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["bench", "policy", "--trace", str(file), "--budgets", "1024", "--gateways", "0"])
+    told = capsys.readouterr()
+    assert ended.value.code == 0
+    assert "[bold] name: clairvoyant" in told.err
+    assert "| cold starts in percent / GB held idle | 1 GB |" in told.out
+    assert "| `default` | " in told.out
 
 
 def test_an_unknown_trace_is_refused() -> None:
