@@ -100,6 +100,8 @@ def decide(current: Record | None, asked: Write, gateway: str) -> Record:
     Raises:
         ConflictError: the record has moved on since the writer read it.
         Behind: the writer has seen a newer version than the owner has.
+        PayloadError: its version has no room for one more write (a forged one, since nobody writes so often): the
+            replicas would refuse it, and the write stand on one disk alone.
     """
     if current is not None and asked.write and current.write == asked.write:
         return current
@@ -112,10 +114,17 @@ def decide(current: Record | None, asked: Write, gateway: str) -> Record:
         if descends(asked.expected, version):
             raise Behind
         raise ConflictError(f"{asked.key} has moved on to {version}", remedy="read it and decide again")
+    version = increment(version, gateway)
+    try:
+        check_version(version)
+    except PayloadError as error:
+        raise PayloadError(
+            f"{asked.key} cannot be changed any more: {error.message}", remedy="write what it held under another key"
+        ) from None
     return Record(
         key=asked.key,
         value=b"" if asked.deleted else asked.value,
-        version=increment(version, gateway),
+        version=version,
         deleted=asked.deleted,
         write=asked.write,
     )

@@ -108,6 +108,23 @@ async def test_outdated_and_forged_versions_lose_nothing(tmp_path: Path, free_po
         assert read.value == b"2"
 
 
+async def test_a_version_without_room_is_said_so_and_the_record_stays(
+    tmp_path: Path, free_ports: Callable[..., list[int]]
+) -> None:
+    """A forged count that no write can follow: the writer is told, whoever orders it, and what was there is read."""
+    async with _planes(tmp_path, free_ports(2), "f") as planes:
+        version = {"g0": 2**53 - 1, "g1": 2**53 - 1}
+        ask = StoreAsk(Record(key="task/1", value=b"1", version=version, write="x"))
+        for plane, other in ((planes[0], "g1"), (planes[1], "g0")):
+            await plane.rpc.call(other, "dht_store", ask, Found)
+        for plane in planes:
+            with pytest.raises(PayloadError, match="cannot be changed any more"):
+                await plane.dht.write("task/1", b"2", expected=version)
+            read = await plane.dht.read("task/1")
+            assert read is not None
+            assert (read.value, read.version) == (b"1", version)
+
+
 async def test_what_is_not_known_is_kept(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
     """A value is bytes to the plane: fields of a later version come back as they were written, also when copies met."""
     async with _planes(tmp_path, free_ports(2), "f") as (one, _):

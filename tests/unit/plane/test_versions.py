@@ -135,6 +135,15 @@ def test_an_owner_that_is_behind_says_so() -> None:
         decide(here, Write(key="k", value=b"2", expected={"a": 2}, write="w"), "a")
 
 
+@pytest.mark.parametrize("version", [{"a": 2**53 - 1}, {f"g{number}": 1 for number in range(256)}])
+def test_what_the_replicas_would_refuse_is_not_decided(version: dict[str, int]) -> None:
+    """A version without room for one more write, as only a forged one is, is refused by its owner, with the reason."""
+    full = check_record(Record(key="k", value=b"1", version=version), max_bytes=10)
+    for deleted in (False, True):
+        with pytest.raises(PayloadError, match="k cannot be changed any more"):
+            decide(full, Write(key="k", deleted=deleted, expected=version, write="w"), "a")
+
+
 @given(records, records)
 def test_digests_tell_records_apart(one: Record, other: Record) -> None:
     """Digests are equal exactly when version, content and removal are."""
