@@ -295,11 +295,11 @@ class Gateway:
     async def _stop_pool(self) -> None:
         await self.pool.stop(keep_containers=self.config.keep_containers)
 
-    async def stop(self) -> None:
-        """Drain, then stop every part in reverse order."""
+    async def stop(self, *, at_once: bool = False) -> None:
+        """Drain, then stop every part in reverse order; `at_once`: runs are cancelled, and repeated elsewhere."""
         self._draining = self._robot_tasks.draining = True
         draining = self.migration.draining
-        draining.begin(max(0.001, self.config.drain_s), stopping=True)
+        draining.begin(0.001 if at_once else max(0.001, self.config.drain_s), stopping=True)
         self._publish_status()
         try:
             await draining.until_empty()
@@ -413,7 +413,11 @@ class Gateway:
 
 
 async def run(config: GatewayConfig) -> None:
-    """Run the daemon until SIGTERM or SIGINT; a second signal stops it at once."""
+    """Run the daemon until SIGTERM or SIGINT; a second signal stops it at once.
+
+    Raises:
+        ConfigError: as `Gateway.start`; or another gateway of this one's id is there, and this one had to go.
+    """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -421,23 +425,25 @@ async def run(config: GatewayConfig) -> None:
     gateway = Gateway(config)
     await gateway.start()
     service.ready()
-    watchdog = asyncio.create_task(_watchdog(), name="watchdog")
+    watchdog = asyncio.create_task(service.keep_alive(), name="watchdog")
+    stopped = asyncio.create_task(stop.wait(), name="stopped")
+    displaced = asyncio.create_task(gateway.plane.displaced(), name="displaced")
+    problem: ConfigError | None = None
     try:
-        await stop.wait()
+        await asyncio.wait({stopped, displaced}, return_when=asyncio.FIRST_COMPLETED)
+        if not stop.is_set():
+            problem = displaced.result()
+            log.error("this gateway stops: its id is another's", reason=str(problem))
     finally:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.remove_signal_handler(number)
         service.stopping()
         try:
-            await gateway.stop()
+            # Two that answer the same questions can give nothing away in good order.
+            await gateway.stop(at_once=problem is not None)
         finally:
             # Draining takes a while, in which the loop must go on being seen to turn.
-            watchdog.cancel()
-
-
-async def _watchdog() -> None:
-    """Tell systemd that the event loop turns."""
-    interval_s = service.watchdog_s()
-    while interval_s:
-        service.alive()
-        await asyncio.sleep(interval_s)
+            for each in (watchdog, stopped, displaced):
+                each.cancel()
+    if problem is not None:
+        raise problem

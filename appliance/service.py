@@ -3,6 +3,7 @@
 Without systemd every call does nothing, so daemons tell it unconditionally.
 """
 
+import asyncio
 import os
 from functools import cache
 from typing import Any
@@ -33,3 +34,11 @@ def stopping() -> None:
 def watchdog_s() -> float:
     """Half the interval within which systemd wants to hear `alive`, seconds; 0 without a watchdog."""
     return int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
+
+
+async def keep_alive() -> None:
+    """Tell systemd that the event loop turns, until cancelled; returns at once without a watchdog."""
+    interval_s = watchdog_s()
+    while interval_s:
+        alive()
+        await asyncio.sleep(interval_s)

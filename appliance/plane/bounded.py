@@ -29,6 +29,11 @@ _ASK_S = 1.0
 _JOIN_TRIES = 5
 _MOST_CONTACTS = 8
 """Gateways that a joiner remembers of all whose tokens it sees: one would do."""
+_ALONE_S = 2.0
+"""How often one that knows of nobody looks who is there: those that start at one moment see no tokens yet."""
+_STRANGERS_S = 60.0
+"""How often one of a ring meets somebody whom it does not know, at least; of a large ring one each second. Two rings
+that know nothing of each other, after a long cut or a start of many at one moment, become one by that."""
 
 
 class Heard(Struct, frozen=True):
@@ -51,7 +56,7 @@ class BoundedMembership(Membership):
         self._contacts: list[str] = []
         self._watched: dict[str, Closer] = {}
         self._sooner = asyncio.Event()
-        self._running: asyncio.Task[None] | None = None
+        self._running: list[asyncio.Task[None]] = []
         rpc.register("ring_next", NextAsk, self._on_next, exchange=False)
         rpc.register("ring_meet", MeetAsk, self._on_meet, exchange=False)
         rpc.register("ring_leave", LeaveAsk, self._on_leave, exchange=False)
@@ -90,9 +95,16 @@ class BoundedMembership(Membership):
 
     async def enter(self) -> None:
         """Find this gateway's place on the ring and its neighbours; errors as for `Plane.open`."""
-        if not self._contacts:
-            self._run()
-            return
+        if self._contacts:
+            await self._find_place()
+        self._entered = True
+        self._running = [
+            asyncio.create_task(self._keep_up(), name="ring"),
+            asyncio.create_task(self._look_round(), name="strangers"),
+        ]
+
+    async def _find_place(self) -> None:
+        before = self._view, self._upkeep
         for _ in range(_JOIN_TRIES):
             view = View(self._me, bound=self._view.bound, replicas=self._replicas)
             view.hear(self._contacts)
@@ -103,23 +115,20 @@ class BoundedMembership(Membership):
             with contextlib.suppress(SwiftbotError):
                 ask = MeetAsk(self._me, all=True)
                 told = await self._rpc.call(found.owner, "ring_meet", ask, Around, timeout_s=_ASK_S)
-                self._upkeep.joined(found.owner, told, self._now())
+                self._upkeep.joined(found.owner, _checked(told), self._now())
                 self._follow()
-                self._run()
                 return
+        self._view, self._upkeep = before
         raise UnreachableError("no member of the ring answers", remedy="is the fleet up, and linked?")
-
-    def _run(self) -> None:
-        self._entered = True
-        self._running = asyncio.create_task(self._keep_up(), name="ring")
 
     async def leave(self) -> None:
         """Tell the neighbours, and stop."""
-        if self._running is None:
+        if not self._running:
             return
-        self._running.cancel()
-        await asyncio.gather(self._running, return_exceptions=True)
-        self._running = None
+        for each in self._running:
+            each.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
+        self._running = []
         ask, near = self._upkeep.leaving()
 
         async def tell(name: str) -> None:
@@ -171,6 +180,33 @@ class BoundedMembership(Membership):
                     self._upkeep.found((found.owner, *found.replicas), self._now())
             case None:
                 pass
+        self._follow()
+
+    async def _look_round(self) -> None:
+        while True:
+            alone = not len(self._view)
+            often_s = _ALONE_S if alone else max(_STRANGERS_S, self._view.estimate())
+            await asyncio.sleep(often_s * self._rng.uniform(0.5, 1.5))
+            try:
+                await self._meet_stranger()
+            except SwiftbotError as error:
+                log.info("somebody who is not known was not met", reason=str(error))
+            except Exception:  # supervision boundary: the next one may be met
+                log.exception("looking round the ring failed")
+
+    async def _meet_stranger(self) -> None:
+        """Meet somebody whose token is there and whom this gateway does not know; join, if it knows nobody."""
+        tokens = await self._session.alive_now(self._session.keys.alive())
+        names = {key.split("/")[-2] for key in tokens} - {self._me, *self._view.names}
+        if not names:
+            return
+        if not len(self._view):
+            self._contacts = self._rng.sample(sorted(names), min(len(names), _MOST_CONTACTS))
+            await self._find_place()
+            return
+        name = self._rng.choice(sorted(names))
+        told = await self._rpc.call(name, "ring_meet", MeetAsk(self._me), Around, timeout_s=_ASK_S)
+        self._upkeep.met(name, _checked(told), self._now())
         self._follow()
 
     async def _look_up(self, target: int) -> Owners | None:

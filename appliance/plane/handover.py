@@ -13,6 +13,7 @@ from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
+from appliance.plane.versions import Record
 
 log = structlog.get_logger(__name__)
 
@@ -49,18 +50,42 @@ class HandOver:
             complete &= all(await asyncio.gather(*(self._give(ring, key, replicas) for key, replicas in page)))
         return complete
 
+    async def give_all(self) -> int:
+        """Give a copy of everything here to those that would hold it without this gateway; returns how many were taken.
+
+        For one that goes where nobody can ask it for what it has: another answers to its id.
+        """
+        ring = self._membership.ring.without_member(self._gateway)
+        keys = [key for key, _ in await self._store.digests()] if ring.members else []
+        taken = 0
+        for start in range(0, len(keys), _AT_ONCE):
+            page = keys[start : start + _AT_ONCE]
+            gives = (self._offer(key, ring.successors(key, self._config.replicas)) for key in page)
+            taken += sum(await asyncio.gather(*gives))
+        return taken
+
+    async def _offer(self, key: str, replicas: tuple[str, ...]) -> bool:
+        record = await self._store.record(key)
+        return record is not None and await self._stored(record, replicas)
+
     async def _give(self, ring: Ring, key: str, replicas: tuple[str, ...]) -> bool:
         record = await self._store.record(key)
         if record is None:
             return True
+        if not await self._stored(record, replicas):
+            return False
+        if ring == self._membership.ring:
+            await self._store.forget(record)
+        return True
+
+    async def _stored(self, record: Record, replicas: tuple[str, ...]) -> bool:
+        """Have all these store a record; False when one did not."""
         ask = StoreAsk(record)
         try:
             await asyncio.gather(
                 *(self._rpc.call(each, "dht_store", ask, Found, timeout_s=_ASK_S) for each in replicas)
             )
         except SwiftbotError as error:
-            log.warning("a copy that belongs elsewhere is kept", key=key, reason=str(error))
+            log.warning("a copy that belongs elsewhere is kept", key=record.key, reason=str(error))
             return False
-        if ring == self._membership.ring:
-            await self._store.forget(record)
         return True

@@ -17,6 +17,7 @@ from appliance.plane.browsing import Browsing
 from appliance.plane.dht import Dht
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
+from appliance.plane.namesake import displaced
 from appliance.plane.outlived import Outlived
 from appliance.plane.pulse import Pulse
 from appliance.plane.quorum.forgetting import Forgetting
@@ -40,6 +41,8 @@ was restarted has nearly all, and is back sooner without."""
 BACK_S = 0.25
 """How long the rest of a gateway's start waits for its shard to be compared: several times what that takes among few.
 Somebody who is seen and does not answer must not hold it up."""
+GIVE_S = 10.0
+"""How long one that has to go gives its records away: thousands, where the others answer."""
 MOST_ASKED = 3
 ASK_TIMEOUT_S = 0.5
 """One that is busy for longer is no help: what is linked directly counts then."""
@@ -162,6 +165,20 @@ class Plane:
             async with asyncio.timeout(timeout_s):
                 await self._back.wait()
         return self._back.is_set()
+
+    async def displaced(self) -> ConfigError:
+        """Wait until another gateway of this one's id is there and this one has to go; returns what is wrong.
+
+        Two of one name can meet although each found it free: they began at one moment, or on two sides of a cut. By
+        then a copy of each record that is here is with the others, who can ask only one of the two for what it has.
+        """
+        await self.registry.displaced.wait()
+        try:
+            async with asyncio.timeout(GIVE_S):
+                await self._reconciler.give_all()
+        except (TimeoutError, SwiftbotError) as error:
+            log.warning("not all records could be given to the others", reason=str(error))
+        return displaced(self.gateway)
 
     async def _join(self) -> None:
         membership = self._membership

@@ -261,6 +261,10 @@ class Reconciler:
         if len(near) <= FEW:
             await self._comparing.compare(ring, near, joining=True)
 
+    async def give_all(self) -> None:
+        """Give everything that is here to the others."""
+        log.info("gave all records to the others", records=await self._hand_over.give_all())
+
     async def close(self) -> None:
         """Stop reconciling."""
         if self._running is not None:

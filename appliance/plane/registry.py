@@ -20,6 +20,7 @@ from appliance.errors import SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
 from appliance.plane.facts import Facts, FactsAsk, Known
 from appliance.plane.membership import Membership
+from appliance.plane.namesake import Namesake
 from appliance.plane.roster import Roster
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
@@ -78,6 +79,9 @@ class Registry:
         """What those gateways that decide anything say is asked for."""
         self._doubted: dict[str, float] = {}
         self._speaker: Speaker | None = None
+        self._namesake = Namesake() if gateway is not None else None
+        self.displaced = asyncio.Event()
+        """Another process goes by this gateway's id, and this one has to go."""
         if gateway is not None:
             rpc.register("facts", FactsAsk, self._on_facts, exchange=False)
             self._speaker = Speaker(
@@ -91,7 +95,10 @@ class Registry:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
         self._roster.start()
-        if not self._bounded:
+        if self._bounded:
+            # Nobody in particular is listened to yet, but whoever goes by this gateway's own name.
+            self._closers = [session.subscribe_typed(keys.status(self._gateway), GatewayStatus, self._on_status)]
+        else:
             self._closers = [
                 session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
                 session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
@@ -198,6 +205,8 @@ class Registry:
 
     def _on_status(self, key: str, status: GatewayStatus | None) -> None:
         gateway = key.split("/")[-2]
+        if gateway == self._gateway and status is not None:
+            self._on_own(status)
         if gateway == self._gateway or status is None or not self._is_member(gateway):
             return
         if status.id != gateway:
@@ -205,6 +214,17 @@ class Registry:
             return
         self._count(gateway)
         self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
+
+    def _on_own(self, status: GatewayStatus) -> None:
+        """What is told under this gateway's name: by itself, or by another that goes by it."""
+        if self._namesake is None or not self._namesake.heard(
+            status, self.gateways.get(self._gateway or ""), time.monotonic()
+        ):
+            return
+        ends = ", ".join(status.endpoints) or "no endpoint"
+        self._session.refuse("another gateway with this id", says=status.id, its_pid=status.pid, listens_on=ends)
+        if self._namesake.goes:
+            self.displaced.set()
 
     def _learn_status(self, gateway: str, status: GatewayStatus, *, age_s: float) -> None:
         self.gateways[gateway] = status

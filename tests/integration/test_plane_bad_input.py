@@ -3,8 +3,10 @@
 import asyncio
 import contextlib
 import datetime as dt
+import itertools
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import zenoh
@@ -62,6 +64,57 @@ async def test_two_fleets_on_one_network_do_not_meet(tmp_path: Path, free_ports:
         await _until(lambda: "g0" in planes[1].registry.gateways)
         assert not planes[3].registry.gateways
         assert all(not plane.session.refused for plane in planes)
+
+
+@pytest.mark.parametrize("view", ["full", 16])
+async def test_gateways_of_one_id_that_meet_later_are_told_apart(
+    tmp_path: Path, free_ports: Callable[..., list[int]], view: Literal["full"] | int
+) -> None:
+    """Two of one id that could not see each other meet: both count it, one has to go, and no record is lost.
+
+    The other way round, by an id that is taken when it joins, is `test_an_id_that_is_taken_is_refused`.
+    """
+    ends = [f"tcp/127.0.0.1:{port}" for port in free_ports(3)]
+    async with contextlib.AsyncExitStack() as stack:
+
+        async def join(number: int, name: str, connect: tuple[str, ...]) -> Plane:
+            config = PlaneConfig(
+                listen=(ends[number],), connect=connect, view=view, lease_ms=500, join_wait_s=0.0, anti_entropy_s=0.5
+            )  # fmt: skip
+            plane = await Plane.open(config, fleet="f", gateway=name, data_dir=tmp_path / str(number))
+            stack.push_async_callback(plane.close)
+            return plane
+
+        # The third links the two, and is not there yet.
+        same = [await join(number, "g0", (ends[2],)) for number in range(2)]
+        for number, plane in enumerate(same):
+            await plane.dht.write(f"task/{number}", b"x", expected=None)
+        going = [asyncio.create_task(plane.displaced()) for plane in same]
+
+        async def speak() -> None:
+            for turn in itertools.count():
+                for number, plane in enumerate(same):
+                    load = turn % 2 / 2
+                    status = GatewayStatus(id="g0", fleet="f", load=load, started_ns=5 - number, pid=number + 1)
+                    plane.registry.publish_status(status)
+                await asyncio.sleep(0.1)
+
+        third = await join(2, "g2", ())
+        speaking = asyncio.create_task(speak())
+        try:
+            await _until(lambda: all(plane.session.refused.get("another gateway with this id") for plane in same))
+        finally:
+            speaking.cancel()
+        await going[0]
+        assert not going[1].done()
+        assert "give each gateway an id of its own" in str(going[0].result())
+        going[1].cancel()
+        await same[0].close()
+        await _until(lambda: third.members() == same[1].members() == {"g0", "g2"})
+        for number in range(2):
+            # The one that stays hears of what the other had at its next comparison.
+            while await third.dht.read(f"task/{number}") is None:
+                await asyncio.sleep(0.05)
 
 
 @pytest.mark.parametrize("hours", [1, -1])

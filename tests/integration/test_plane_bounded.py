@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from appliance.errors import ConflictError, PayloadError
+from appliance.plane import bounded
 from appliance.plane.node import Plane
 from appliance.plane.overlay.lookup import NextAsk
 from appliance.plane.overlay.view import Step
@@ -91,3 +92,36 @@ async def test_records_are_found_through_bounded_views(tmp_path: Path, free_port
             read = await planes[left[number % len(left)]].dht.read(key)
             assert read is not None
             assert read.version == version
+
+
+async def test_those_that_began_apart_become_one_ring(
+    tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two that each took themselves for the first, and two rings of two, are one ring once they are linked."""
+    monkeypatch.setattr(bounded, "_STRANGERS_S", 1.0)
+    ends = [f"tcp/127.0.0.1:{port}" for port in free_ports(5)]
+    async with contextlib.AsyncExitStack() as stack:
+        planes: dict[str, Plane] = {}
+
+        async def join(number: int, connect: tuple[str, ...]) -> None:
+            config = PlaneConfig(listen=(ends[number],), connect=connect, view=VIEW, join_wait_s=0.0)
+            planes[f"g{number}"] = await Plane.open(
+                config, fleet="f", gateway=f"g{number}", data_dir=tmp_path / f"{number}"
+            )
+            stack.push_async_callback(planes[f"g{number}"].close)
+
+        # Nobody listens at the last end yet, so none of the first three, and neither pair, sees another.
+        await join(0, (ends[4],))
+        await join(1, (ends[4], ends[0]))
+        await join(2, (ends[4],))
+        await join(3, (ends[4], ends[2]))
+        await _until(lambda: all(len(plane.members()) == 2 for plane in planes.values()))
+        await planes["g0"].dht.write("key/1", b"1", expected=None)
+        await planes["g2"].dht.write("key/2", b"2", expected=None)
+        await join(4, ())
+        await _until(lambda: all(len(plane.members()) == 5 for plane in planes.values()))
+        for plane in planes.values():
+            for number in (1, 2):
+                read = await plane.dht.read(f"key/{number}")
+                assert read is not None
+                assert read.value == b"%d" % number

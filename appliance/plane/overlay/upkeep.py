@@ -1,10 +1,10 @@
 """Keeping a bounded view in step with the ring: joining, meeting neighbours, mending after failures, gossip.
 
 A round is one errand: meet a member (swap neighbours and a few others, and see that it is there) or look up a
-finger's position. Neighbours matter most, so every other round goes to them; the rest in turn, whoever was not heard
-of for longest first. When a round finds something changed the next comes sooner, when not, later: at rest a gateway
-sends a few bytes a second, and under churn as much as it takes (`Pace`). Pure: rounds come from `due`, what came of
-them goes back in, and time is passed in.
+finger's position. Neighbours matter most, so every other round goes to them; fingers are looked up in turn, and the
+rest met in turn, whoever was not heard of for longest first. When a round finds something changed the next comes
+sooner, when not, later: at rest a gateway sends a few bytes a second, and under churn as much as it takes (`Pace`).
+Pure: rounds come from `due`, what came of them goes back in, and time is passed in.
 """
 
 import random
@@ -87,6 +87,8 @@ class Upkeep:
         """Member -> questions in a row that it has not answered in time."""
         self._newest: list[str] = []
         self._turn = 0
+        self._finger = rng.randrange(view.bound)
+        """Number of the finger looked up last; the first is drawn, so that not all members begin with the nearest."""
         self._first: list[str] = []
         """To be met before all others, the last first: a joiner's neighbours; members that their neighbour left out."""
 
@@ -131,7 +133,9 @@ class Upkeep:
             return Meet(before[0] if short and before else view.names[-1])
         targets = view.targets() if self._turn % 4 == 2 and not view.whole else []
         if targets:
-            return Seek(self._rng.choice(targets))
+            # One after the other: drawn by lot, one of twenty would wait for three times as many rounds, now and then.
+            self._finger = (self._finger + 1) % len(targets)
+            return Seek(targets[self._finger])
         return Meet(min(view.names, key=lambda name: self._seen.get(name, 0.0)))
 
     def met(self, member: str, told: Around, now: float) -> None:

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.bench.dht.fleet import Fleet
-from appliance.plane.overlay.upkeep import Meet, MeetAsk, Pace, Upkeep
+from appliance.plane.overlay.upkeep import Meet, MeetAsk, Pace, Seek, Upkeep
 from appliance.plane.overlay.view import Around, View, bound_for, successor_count
 from appliance.plane.ring import Ring
 
@@ -106,6 +106,19 @@ def test_rest_is_quiet_and_trouble_is_not() -> None:
     assert fleet.members[name].interval_s == Pace().most_s * Pace().faster
 
 
+def test_fingers_are_looked_up_in_turn() -> None:
+    """In as many look-ups as there are fingers each has had its own; not all members begin with the same one."""
+    fleet = Fleet(bound=24).settled(f"gw-{n}" for n in range(200))
+    first: set[int] = set()
+    for upkeep in fleet.members.values():
+        targets = upkeep.view.targets()
+        rounds = [upkeep.due(float(number)) for number in range(4 * len(targets))]
+        sought = [each.target for each in rounds if isinstance(each, Seek)]
+        assert sorted(sought) == sorted(targets)
+        first.add(targets.index(sought[0]))
+    assert len(first) > 1
+
+
 @given(st.integers(1, 10**6), st.integers(1, 200))
 def test_the_successor_list_grows_with_the_logarithm(size: int, bound: int) -> None:
     """It never shrinks as the ring grows, is 20 for 1,000 members, and leaves half the view to others."""
@@ -178,6 +191,24 @@ def test_two_halves_that_lost_each_other_grow_together() -> None:
         check_neighbours(fleet)
     fleet.members = everybody
     fleet.rounds(200)
+    check_neighbours(fleet)
+    check_closed(fleet)
+
+
+@pytest.mark.parametrize("size", [4, 60])
+def test_two_rings_that_never_heard_of_each_other_become_one(size: int) -> None:
+    """Each second one of all meets somebody it does not know, as it finds by tokens; the rest is gossip."""
+    fleet = Fleet(bound=bound_for(size), seed=2)
+    names = [f"gw-{number}" for number in range(size)]
+    fleet.settled(names[::2]).settled(names[1::2])
+    for _ in range(100):
+        fleet.rounds(1)
+        name = fleet.any()
+        strangers = sorted(set(names) - {name, *fleet.members[name].view.names})
+        if strangers:
+            stranger = fleet.rng.choice(strangers)
+            told = fleet.members[stranger].asked(MeetAsk(name), fleet.now)
+            fleet.members[name].met(stranger, told, fleet.now)
     check_neighbours(fleet)
     check_closed(fleet)
 

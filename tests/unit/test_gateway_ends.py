@@ -1,0 +1,72 @@
+"""How a gateway's daemon ends: told to stop, it drains; where another has its id it goes at once, with an error."""
+
+import asyncio
+import os
+import signal
+from typing import Any
+
+import pytest
+
+from appliance import gateway as daemon
+from appliance import service
+from appliance.errors import ConfigError, Exit
+from appliance.plane.namesake import displaced
+
+pytestmark = pytest.mark.anyio
+
+
+class Fake:
+    """In place of a gateway, and of its plane: what was done with it."""
+
+    def __init__(self) -> None:
+        self.plane = self
+        self.taken = asyncio.Event()
+        self.started = asyncio.Event()
+        self.stopped: list[bool] = []
+
+    async def displaced(self) -> ConfigError:
+        """Wait until another has its id."""
+        await self.taken.wait()
+        return displaced("gw-1")
+
+    async def start(self) -> None:
+        """Note it."""
+        self.started.set()
+
+    async def stop(self, *, at_once: bool) -> None:
+        """Note how."""
+        self.taken.set()  # what comes while it stops changes nothing any more
+        await asyncio.sleep(0)
+        self.stopped.append(at_once)
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
+    """The daemon's gateway."""
+    it = Fake()
+    monkeypatch.setattr(daemon, "Gateway", lambda _: it)
+    for each in ("ready", "stopping"):
+        monkeypatch.setattr(service, each, lambda: None)
+    return it
+
+
+async def test_told_to_stop_it_drains(fake: Fake) -> None:
+    """SIGTERM ends it without an error."""
+    config: Any = None
+    running = asyncio.create_task(daemon.run(config))
+    await fake.started.wait()
+    os.kill(os.getpid(), signal.SIGTERM)
+    await running
+    assert fake.stopped == [False]
+
+
+async def test_where_another_has_its_id_it_goes(fake: Fake) -> None:
+    """It stops at once, and the error, which no supervisor retries, says what to do."""
+    config: Any = None
+    running = asyncio.create_task(daemon.run(config))
+    await fake.started.wait()
+    fake.taken.set()
+    with pytest.raises(ConfigError, match="give each gateway an id of its own") as raised:
+        await running
+    assert raised.value.exit_code is Exit.USAGE
+    assert fake.stopped == [True]
