@@ -14,7 +14,7 @@ import random
 import resource
 import sys
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from appliance import logs
 from appliance.errors import SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus
 from appliance.plane.node import Plane
+from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 
 STATUS_S = 2.0
@@ -132,17 +133,20 @@ class Host:
     async def _settled(self, ask: dict[str, Any]) -> dict[str, float]:
         """Wait until every member here knows all the others it should, and has reconciled; answers since when.
 
-        A bounded view goes on taking better members for those it has, for minutes after the last has come: where
-        `behind_s` is given a member may be so long behind with the facts and records of those it has just met.
+        `names` are all members. With a bounded view each is to know those that stand next to it on the true ring, so
+        many `after` it and `before` it, and the facts of all that it knows; else all. A bounded view goes on taking
+        better members for those it has, for minutes after the last has come: where `behind_s` is given a member may be
+        so long behind with the facts and records of those it has just met.
         """
-        wanted, behind_s = int(ask["members"]), float(ask.get("behind_s", 0.0))
+        behind_s = float(ask["behind_s"])
+        wanted = _wanted(ask["names"], self._planes, ask.get("after", 0), ask.get("before", 0))
         since: dict[str, float] = {}
         last: dict[str, float] = {}
         while True:
             now = time.monotonic()
             for name, plane in self._planes.items():
                 members = plane.members()
-                known = len(members) >= wanted and members <= plane.registry.gateways.keys()
+                known = wanted[name] <= members <= plane.registry.gateways.keys()
                 if known and plane.dht.reconciled():
                     since.setdefault(name, now)
                     last[name] = now
@@ -231,6 +235,18 @@ class Host:
             task.cancel()
         await asyncio.gather(*self._publishing, return_exceptions=True)
         await asyncio.gather(*(plane.close() for plane in self._planes.values()))
+
+
+def _wanted(names: Sequence[str], here: Collection[str], after: int, before: int) -> dict[str, frozenset[str]]:
+    """Whom each of those that are `here` should know: its neighbours on the true ring; all, if no number is given."""
+    if not after:
+        return dict.fromkeys(here, frozenset(names))
+    line = Ring(names, virtual_nodes=1).names
+    return {
+        name: frozenset(line[(place + step) % len(line)] for step in range(-before, after + 1))
+        for place, name in enumerate(line)
+        if name in here
+    }
 
 
 async def _serve(options: HostOptions) -> None:

@@ -7,6 +7,7 @@ killed with SIGKILL. Times are told by the members themselves, on the machine's 
 import asyncio
 import contextlib
 import json
+import math
 import secrets
 import signal
 import sys
@@ -197,8 +198,13 @@ class Fleet:
         await self._open()
         opened = time.monotonic()
         self._progress(f"all are open after {opened - began:.1f} s, now they get to know each other")
-        wanted = options.members if not bound else min(options.members, bound // 2)
-        await self._all("settled", members=wanted, behind_s=_BEHIND_S if bound else 0.0)
+        if bound:
+            # What lookups and copies rest on: who stands next to it, one more than hold its records before it.
+            size = len(self._names)
+            after, before = math.ceil(math.log2(max(2, size))), PlaneConfig().replicas + 1
+            await self._all("settled", names=self._names, after=after, before=before, behind_s=_BEHIND_S)
+        else:
+            await self._all("settled", names=self._names, behind_s=0.0)
         result["open_s"], result["all_know_all_s"] = round(opened - began, 2), round(time.monotonic() - began, 2)
         self._progress(f"all know all after {result['all_know_all_s']} s; idle for {options.idle_s:g} s")
         result |= await self._idle(empty_mb)
