@@ -95,7 +95,7 @@ class Registry:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
         self._roster.start()
-        if self._bounded:
+        if self._bounded and self._gateway is not None:
             # Nobody in particular is listened to yet, but whoever goes by this gateway's own name.
             self._closers = [session.subscribe_typed(keys.status(self._gateway), GatewayStatus, self._on_status)]
         else:

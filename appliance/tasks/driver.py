@@ -31,7 +31,6 @@ from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
 from appliance.tasks.planning import plan_it
 from appliance.tasks.replanning import Replanning
-from appliance.tasks.soundness import Unknown
 from appliance.tasks.steering.driving import Steering
 from appliance.tasks.surroundings import (
     CancelAsked,
@@ -45,6 +44,7 @@ from appliance.tasks.surroundings import (
     Surroundings,
     Wake,
 )
+from appliance.tasks.unknown import Unknown
 
 log = structlog.get_logger(__name__)
 
@@ -80,7 +80,7 @@ class Driver:
         """Why the task is to be ended instead of driven: earlier drivers of it broke."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
         self._keeper = Keeper(around.plane, record, version, on_change, elapsed_s)
-        self._keeper.unknown = unknown or {}
+        self._keeper.unknown = unknown or Unknown()
         self._keeper.on_written = self._written
         self._keeper.on_published = around.recovery.published
         self._orders = Orders(around, self.tell)

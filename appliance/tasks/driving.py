@@ -18,8 +18,9 @@ from appliance.tasks.deadline import Ages
 from appliance.tasks.driver import Driver
 from appliance.tasks.healing import heal, unheard
 from appliance.tasks.keeper import Keeper
-from appliance.tasks.soundness import unknown, unsound
+from appliance.tasks.soundness import unsound
 from appliance.tasks.surroundings import Surroundings, task_key
+from appliance.tasks.unknown import unknown
 
 log = structlog.get_logger(__name__)
 
@@ -163,7 +164,7 @@ class Driving:
                 continue
             if record.state.final:
                 final[stored.key] = stored.version
-                self._heal_ended(record, stored.version)
+                self._heal_ended(record, stored.version, stored.value)
             elif record.id not in self.drivers:
                 self.drive(record, stored.version, stored.value)
             elif unheard(record, self.drivers[record.id].record):
@@ -172,12 +173,13 @@ class Driving:
                 self._sweep_soon()
         self._final = final
 
-    def _heal_ended(self, record: TaskRecord, version: VersionVector) -> None:
+    def _heal_ended(self, record: TaskRecord, version: VersionVector, value: bytes) -> None:
         """Tell what became of a task that had been ended on one side of a partition and went on on the other."""
         healing = heal(record)
         if healing is None or record.id in self._healing or self._stopping:
             return
         keeper = Keeper(self._plane, record, version, lambda _: None)
+        keeper.unknown = unknown(value)
         work = asyncio.create_task(healing.settle(self._plane, keeper), name=f"heal {record.id}")
         self._healing[record.id] = work
         work.add_done_callback(lambda done: self._healed(record.id, done))

@@ -14,8 +14,8 @@ from appliance.plane.node import Plane
 from appliance.tasks import machine
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.soundness import Unknown, with_unknown
 from appliance.tasks.surroundings import task_key
+from appliance.tasks.unknown import Unknown, with_unknown
 
 
 class SupersededError(SwiftbotError):
@@ -43,7 +43,7 @@ class Keeper:
         self._on_change = on_change
         self._pending: list[Transition] = []
         self._dirty = False
-        self.unknown: Unknown = {}
+        self.unknown = Unknown()
         """Fields of the record that this version does not know, and keeps."""
         self.ready_ns: dict[str, int] = {}
         """When each subtask became ready, on this machine's clock."""

@@ -1,23 +1,17 @@
-"""What a task record from elsewhere must be like to be driven, and what of it is kept though not understood. Pure.
+"""What a task record from elsewhere must be like to be driven. Pure.
 
 Records come from other gateways, of other versions too, and a stranger on the network can write one. One that can
-never end (a cycle), or is beyond all bounds, is ended with the reason instead of being driven; fields that this version
-does not know stay in it, for those that do.
+never end (a cycle), or is beyond all bounds, is ended with the reason instead of being driven.
 """
 
-from typing import Any, cast
-
-import msgspec
+from graphlib import CycleError, TopologicalSorter
 
 from appliance.llm.validate import MAX_SUBTASKS
-from appliance.model import Failure, SubtaskRecord, TaskRecord, encode
+from appliance.model import Failure, TaskRecord
 from appliance.tasks.bounds import MAX_DEPTH, clean, too_deep
 
 MOST_SUBTASKS = 8 * MAX_SUBTASKS
 """Of a record: a plan's, and those that revisions have added."""
-
-Unknown = dict[str, dict[str, Any]]
-"""Fields by where they stand: "" for the record itself, else a subtask's id."""
 
 
 def unsound(record: TaskRecord) -> Failure | None:
@@ -39,48 +33,14 @@ def _reason(record: TaskRecord) -> str:
             return f"{_short(each.subtask.id)} comes after {_short(missing[0])}, which there is not"
         if too_deep(each.subtask.params) or too_deep(each.result):
             return f"{_short(each.subtask.id)} has data nested more than {MAX_DEPTH} deep"
-    done: set[str] = set()
-    while ready := [name for name, after in before.items() if name not in done and done.issuperset(after)]:
-        done.update(ready)
-    if len(done) < len(before):
-        circle = sorted(name for name in before if name not in done)
-        return f"{', '.join(_short(name) for name in circle[:5])} wait for each other"
+    try:
+        # In time that grows with the record: what comes after what may fill megabytes.
+        TopologicalSorter(before).prepare()
+    except CycleError as error:
+        circle: list[str] = error.args[1][:-1]
+        return f"{', '.join(_short(name) for name in sorted(circle)[:5])} wait for each other"
     return ""
 
 
 def _short(name: str) -> str:
     return repr(clean(name, 40))
-
-
-def unknown(value: bytes) -> Unknown:
-    """Return the fields of a stored record that this version does not know; empty for one that cannot be read."""
-    try:
-        raw = msgspec.json.decode(value)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return {}
-    if not isinstance(raw, dict):
-        return {}
-    table = cast("dict[str, Any]", raw)
-    found: Unknown = {}
-    if extra := _extra(table, TaskRecord):
-        found[""] = extra
-    subtasks: object = table.get("subtasks")
-    for each in cast("list[Any]", subtasks) if isinstance(subtasks, list) else []:
-        if isinstance(each, dict) and (more := _extra(cast("dict[str, Any]", each), SubtaskRecord)):
-            found[str(cast("dict[str, Any]", each).get("subtask", {}).get("id", ""))] = more
-    return found
-
-
-def _extra(table: dict[str, Any], kind: type[msgspec.Struct]) -> dict[str, Any]:
-    return {key: value for key, value in table.items() if key not in kind.__struct_fields__}
-
-
-def with_unknown(record: TaskRecord, fields: Unknown) -> bytes:
-    """Encode a record with those fields as they were; a subtask that is gone takes its own along."""
-    if not fields:
-        return encode(record)
-    table: dict[str, Any] = msgspec.to_builtins(record)
-    table |= fields.get("", {})
-    for each in cast("list[dict[str, Any]]", table.get("subtasks", [])):
-        each |= fields.get(each["subtask"]["id"], {})  # noqa: PLW2901 - changed in place
-    return encode(table)

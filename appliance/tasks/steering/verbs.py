@@ -14,12 +14,12 @@ from appliance.tasks.bounds import read_record
 from appliance.tasks.driver import Driver
 from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.soundness import unknown
 from appliance.tasks.steering.api import ActsAsk, ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
 from appliance.tasks.steering.audit import Audit
 from appliance.tasks.steering.deciding import may_pause, may_resume, may_retry, proposal_for
 from appliance.tasks.steering.driving import revived
 from appliance.tasks.surroundings import Steered, task_key
+from appliance.tasks.unknown import unknown, with_unknown
 
 STEER_S = 4.0
 """How long an order may take to be written: a replicated write takes milliseconds, an inbox that is full a second."""
@@ -36,7 +36,7 @@ class OperatorVerbs:
         plane: the fleet.
         drivers: of the tasks that are coordinated here.
         task: returns a task's record.
-        drive: begins to drive a record at a version.
+        drive: begins to drive a record at a version, as it is stored.
         published: hears of each transition that is published.
         audit: of this gateway.
     """
@@ -47,7 +47,7 @@ class OperatorVerbs:
         drivers: Mapping[str, Driver],
         *,
         task: Callable[[TaskAsk], Awaitable[TaskRecord]],
-        drive: Callable[[TaskRecord, VersionVector], None],
+        drive: Callable[[TaskRecord, VersionVector, bytes], None],
         published: Callable[[Transition], None],
         audit: Audit,
     ) -> None:
@@ -147,7 +147,7 @@ class OperatorVerbs:
             now = await self._task(TaskAsk(id=ask.id))
             who = now.retried_by.by if now.retried_by is not None else "somebody else"
             raise ConflictError(f"{who} has had task {ask.id} tried again already") from None
-        self._drive(keeper.record, keeper.version)
+        self._drive(keeper.record, keeper.version, with_unknown(keeper.record, keeper.unknown))
         return keeper.record
 
 

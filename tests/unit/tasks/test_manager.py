@@ -1,6 +1,7 @@
 """Accepting, taking over and answering on fakes: what must not be lost, refused or driven twice."""
 
 import asyncio
+import itertools
 from collections.abc import AsyncIterator
 from types import SimpleNamespace
 from typing import Any, cast
@@ -22,21 +23,26 @@ from appliance.model import (
     RunEvent,
     RunEventKind,
     Site,
+    Split,
     Subtask,
     SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
     TaskRequest,
     TaskState,
     encode,
 )  # fmt: skip
+from appliance.model.tasks import LostRun
 from appliance.plane.dht import Record
 from appliance.pool.api import Hinted
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import driving as module
 from appliance.tasks.api import TaskAsk
+from appliance.tasks.bounds import read_record
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.steering.api import CancelTaskAsk
+from appliance.tasks.steering.api import CancelTaskAsk, RetryAsk
 
 pytestmark = pytest.mark.anyio
 
@@ -293,3 +299,39 @@ async def test_a_plan_that_a_robot_hands_in_waits_where_the_policy_says_so(manag
     assert plans.approval(replace(record, submitter="ann"), plan) == ""
     harmless = plane.plan_of(Subtask(id="s1", skill="hold", robot="rover_1"))
     assert plans.approval(replace(record, submitter="rover_1"), harmless) == ""
+
+
+async def test_fields_of_a_newer_version_stay_whatever_is_done_with_a_task(manager: TaskManager, plane: Any) -> None:
+    """It is driven, cancelled, and begun again after its end; and one that had ended is settled after a partition."""
+    versions = itertools.count(1)
+
+    def later(task: str) -> list[Any]:
+        table = msgspec.json.decode(plane.dht.records[f"task/{task}"].value)
+        return [table.get("later"), *(each.get("later") for each in table.get("subtasks", []))]
+
+    def put(record: TaskRecord) -> None:
+        table = msgspec.json.decode(encode(record)) | {"later": 1}
+        for each in table.get("subtasks", []):
+            each["later"] = 2
+        key, version = f"task/{record.id}", {"gw-2": next(versions)}
+        plane.dht.records[key] = Record(key=key, value=msgspec.json.encode(table), version=version)
+        manager._sweep.set()
+
+    put(plane.accepted(plan=plane.plan_of()))
+    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"].record.state is TaskState.RUNNING)
+    await manager.cancel(CancelTaskAsk(id="t-1"))
+    await until(lambda: manager.unfinished == 0)
+    ended = read_record(plane.dht.records["task/t-1"].value)
+    assert (ended.state, later("t-1")[0]) == (TaskState.CANCELLED, 1)
+    put(ended)
+    await plane.rpc.registered["retry"](RetryAsk(id="t-1", by="ann", act="r"))
+    assert later("t-1") == [1, 2]
+    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"].record.state is TaskState.RUNNING)
+    await manager.cancel(CancelTaskAsk(id="t-1"))
+    await until(lambda: manager.unfinished == 0)
+    assert later("t-1") == [1, 2]
+    lost = LostRun(subtask="s1", attempt=9, gateway="gw-3", state=SubtaskState.RUNNING)
+    split = Split(coordinator="gw-3", sequence=3, state=TaskState.RUNNING, runs=(lost,))
+    put(replace(ended, splits=(split,)))
+    await until(lambda: read_record(plane.dht.records["task/t-1"].value).splits[0].settled)
+    assert later("t-1") == [1, 2]

@@ -1,15 +1,13 @@
-"""Records from elsewhere: unsound ones are told from sound ones, and unknown fields outlive being read and written."""
+"""Records from elsewhere: unsound ones are told from sound ones."""
 
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.model import Subtask, SubtaskRecord, TaskRecord, encode
-from appliance.tasks.bounds import read_record
-from appliance.tasks.soundness import MOST_SUBTASKS, unknown, unsound, with_unknown
+from appliance.model import Subtask, SubtaskRecord, TaskRecord
+from appliance.tasks.soundness import MOST_SUBTASKS, unsound
 
 
 def record(*subtasks: tuple[str, tuple[str, ...]], **params: Any) -> TaskRecord:
@@ -54,24 +52,11 @@ def test_plans_in_order_are_sound(after: list[set[int]]) -> None:
     assert unsound(sound) is None
 
 
-NAMES = st.sampled_from(["later_a", "later_b", "later_c"])
-FIELDS = st.dictionaries(NAMES, st.integers(-9, 9) | st.text("abc", max_size=5), max_size=3)
-
-
-@settings(deadline=None)
-@given(own=FIELDS, subtask=FIELDS)
-def test_unknown_fields_come_back(own: dict[str, Any], subtask: dict[str, Any]) -> None:
-    """Of the record and of its subtasks; what is known is as it was."""
-    known = record(("a", ()), ("b", ("a",)))
-    table: dict[str, Any] = msgspec.json.decode(encode(known)) | own
-    table["subtasks"][1] |= subtask
-    value = encode(table)
-    read = read_record(value)
-    assert read == known
-    assert msgspec.json.decode(with_unknown(read, unknown(value))) == table
-
-
-def test_garbage_has_no_unknown_fields() -> None:
-    """Bytes that are no record give none, and raise nothing."""
-    for value in (b"", b"[]", b"\xff", b'{"subtasks": 3}', b'{"subtasks": [3, {}]}', b"[" * 100_000):
-        assert unknown(value) == {}
+def test_what_comes_after_megabytes_of_others_is_looked_at_once() -> None:
+    """A chain as long as can be, each after all before it many times over, is told sound, or not, without a pause."""
+    names = [f"s{number}" for number in range(MOST_SUBTASKS)]
+    chain = [(name, tuple(names[:place]) * 20) for place, name in enumerate(names)]
+    assert unsound(record(*chain)) is None
+    failure = unsound(record(("s0", (names[-1],)), *chain[1:]))
+    assert failure is not None
+    assert "wait for each other" in failure.message
