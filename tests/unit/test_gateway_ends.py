@@ -24,6 +24,10 @@ class Fake:
         self.started = asyncio.Event()
         self.stopped: list[bool] = []
 
+    def made(self, _: object) -> "Fake":
+        """Stand in for the class."""
+        return self
+
     async def displaced(self) -> ConfigError:
         """Wait until another has its id."""
         await self.taken.wait()
@@ -44,7 +48,7 @@ class Fake:
 def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
     """The daemon's gateway."""
     it = Fake()
-    monkeypatch.setattr(daemon, "Gateway", lambda _: it)
+    monkeypatch.setattr(daemon, "Gateway", it.made)
     for each in ("ready", "stopping"):
         monkeypatch.setattr(service, each, lambda: None)
     return it
