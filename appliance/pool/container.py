@@ -8,6 +8,7 @@ None of it needs Podman's API, so warm containers serve on while Podman is away.
 import asyncio
 import contextlib
 import os
+import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -46,14 +47,17 @@ class Connection:
         """Connect to the runner whose socket is in `folder`.
 
         The path goes through /proc/self/fd, so that a long folder name never meets the 108 bytes that a socket's
-        address may have.
+        address may have. The folder is the container's to write: a link that a handler has put in the socket's place is
+        not followed, or the gateway would speak to whatever it leads to.
 
         Raises:
             OSError: there is no socket, or nobody listens.
         """
-        handle = os.open(folder, os.O_PATH | os.O_DIRECTORY)
+        handle = os.open(folder / SOCKET, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            reader, writer = await asyncio.open_unix_connection(f"/proc/self/fd/{handle}/{SOCKET}", limit=2**20)
+            if not stat.S_ISSOCK(os.fstat(handle).st_mode):
+                raise ConnectionRefusedError(f"{folder / SOCKET} is no socket")
+            reader, writer = await asyncio.open_unix_connection(f"/proc/self/fd/{handle}", limit=2**20)
         finally:
             os.close(handle)
         return cls(reader, writer)

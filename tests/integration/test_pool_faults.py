@@ -8,12 +8,14 @@ import itertools
 import os
 import shutil
 import signal
+import socket
 import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pool_bench import Bench, engine_ids, write_probe
 
 from appliance.model import ContainerState, RunEvent, RunEventKind
@@ -101,6 +103,10 @@ def run(ctx):
             Path(f"/run/swiftbot/{{number}}").write_bytes(bytes(2**18))
             time.sleep(0.02)
         time.sleep(60)
+    if do == "replace the socket":
+        os.unlink("/run/swiftbot/runner.sock")
+        os.symlink(ctx.params["to"], "/run/swiftbot/runner.sock")
+        return {{}}
     if do == "write a little":
         (ctx.volume("keep") / "little").write_bytes(bytes(2**20))
         return {{"left": sorted(os.listdir(ctx.volume("keep")))[:1]}}
@@ -342,6 +348,25 @@ async def test_what_is_written_beside_the_socket(bench: Bench, pool: Pool) -> No
     assert after.container == final.container
     (folder,) = (bench.folder / "run" / bench.fleet / "g1").iterdir()
     assert {each.name for each in folder.iterdir()} == {"runner.sock", "spec.json"}
+
+
+async def test_a_link_in_the_place_of_the_socket(bench: Bench, pool: Pool) -> None:
+    """A handler that links its runner's socket to another one costs its container; nobody speaks to that one."""
+    await bench.ready(pool)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+        where = bench.folder / "other.sock"
+        other.bind(str(where))
+        other.listen()
+        other.setblocking(False)
+        request = bench.request("replace the socket", next(NUMBERS))
+        request = replace(request, params=request.params | {"to": str(where)})
+        decision = await pool.select(request.need, allow_remote=False)
+        final = await pool.run(request, decision, lambda _: None)
+        assert final.kind is RunEventKind.SUCCEEDED, final.failure
+        after = await _next_run_works(bench, pool)
+        assert after.container != final.container
+        with pytest.raises(BlockingIOError):
+            other.accept()
 
 
 async def test_a_neighbour_is_not_touched(bench: Bench) -> None:
