@@ -16,7 +16,7 @@ import pytest
 from msgspec.structs import replace
 from pool_bench import HANDLER, Bench, engine_ids
 
-from appliance.errors import RefusedError
+from appliance.errors import PrerequisiteError, RefusedError
 from appliance.model import ContainerState, Need, Phase, RunEvent, RunEventKind
 from appliance.pool import images
 from appliance.pool.api import EvictAsk
@@ -221,8 +221,8 @@ async def test_podman_restarted_in_mid_run(bench: Bench, service: Service) -> No
             await asyncio.sleep(0.2)
 
 
-async def test_an_image_deleted_under_the_pool(bench: Bench) -> None:
-    """Its warm containers serve on; then the pool says what is missing, and heals when the image is there again."""
+def _own_image(bench: Bench) -> tuple[str, str, str]:
+    """Have the skill `probe` run in an image of the test's own; returns its name, and how Podman calls base and it."""
     name = f"t{secrets.token_hex(4)}"
     folder = bench.folder / "images" / name
     folder.mkdir(parents=True)
@@ -233,8 +233,12 @@ async def test_an_image_deleted_under_the_pool(bench: Bench) -> None:
     spec = ImageSpec(name=name, packages=("python3",), folder=folder)
     skills = {**whole.skills, "probe": replace(whole.skills["probe"], image=name)}
     bench.catalogue = Catalogue(whole.domains, skills, {**whole.images, name: spec})
-    base = images.reference(whole.images["base"], PoolConfig())
-    mine = images.reference(spec, PoolConfig())
+    return name, images.reference(whole.images["base"], PoolConfig()), images.reference(spec, PoolConfig())
+
+
+async def test_an_image_deleted_under_the_pool(bench: Bench) -> None:
+    """Its warm containers serve on; then the pool says what is missing, and heals when the image is there again."""
+    name, base, mine = _own_image(bench)
     await _command("podman", "tag", base, mine)
     try:
         pool = await bench.pool(floor={name: 1}, capacity=2, quarantine_s=600.0)
@@ -253,6 +257,47 @@ async def test_an_image_deleted_under_the_pool(bench: Bench) -> None:
         await _command("podman", "tag", base, mine)
         await _until(lambda: pool.problem == "", "the pool has found it")
         await bench.ready(pool, 1)
+        for each in bench.pools:
+            await each.stop(keep_containers=False)
+    finally:
+        await _command("podman", "rmi", "--ignore", mine)
+
+
+async def test_an_image_removed_by_force_with_its_containers(bench: Bench) -> None:
+    """A run in mid-run ends as retryable; the pool says what is missing, and heals when the image is there again."""
+    name, base, mine = _own_image(bench)
+
+    async def make() -> None:
+        # Not a further name of the base's: only an image of its own is removed with its containers.
+        made = (await _command("podman", "create", base, "true")).split()[-1]
+        await _command("podman", "commit", "--change", f"LABEL made={name}", made, mine)
+        await _command("podman", "rm", made)
+
+    await make()
+    try:
+        # Nothing is started but for runs, or Podman would find the image in use again before it has removed it.
+        pool = await bench.pool(floor={}, capacity=2, quarantine_s=600.0)
+        need = Need(image=name, cpu=0.2, memory_mb=64)
+        request = replace(bench.request("nap"), need=need, params={"do": "nap", "s": 200}, deadline_s=250.0)
+        seen: list[RunEvent] = []
+        run = asyncio.create_task(pool.run(request, await pool.select(need, allow_remote=False), seen.append))
+        await _until(lambda: any(each.kind is RunEventKind.PROGRESS for each in seen), "the run")
+        await _command("podman", "rmi", "--force", mine)
+        final = await run
+        assert final.failure is not None
+        # Told to stop by Podman it says so itself, unless it was killed before that.
+        assert final.failure.code in ("stopped", "pool")
+        assert final.failure.retryable
+        await _until(lambda: not pool.containers(), "it is forgotten")
+        request = replace(bench.request("echo", 2), need=need)
+        with pytest.raises(PrerequisiteError, match="is not on g1"):
+            await pool.run(request, await pool.select(need, allow_remote=False), lambda _: None)
+        assert f"image {mine} is not on g1" in pool.problem
+        assert await engine_ids(bench.fleet) == []
+        await make()
+        await _until(lambda: pool.problem == "", "the pool has found it")
+        after = await pool.run(request, await pool.select(need, allow_remote=False), lambda _: None)
+        assert (after.kind, after.phase) == (RunEventKind.SUCCEEDED, Phase.COLD), after.failure
         for each in bench.pools:
             await each.stop(keep_containers=False)
     finally:
