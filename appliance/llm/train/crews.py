@@ -1,4 +1,4 @@
-"""Makes an order to whomever one to all robots of a roster, to those of a kind, or to all but some of them.
+"""Makes an order to whomever one to several robots: by their names or numbers, to those of a roster or all but some.
 
 Each of them does all of it, at its own pace: the plan has the first step of every one, then the second of every one, as
 people's plans for crews have.
@@ -41,29 +41,86 @@ class _Crew(Struct, frozen=True):
 
 def crewed(example: Example, lexicon: Lexicon, rng: random.Random) -> Example:
     """Return an order to whomever as one to several robots of a roster; any other as it is."""
-    parts = subtasks_of(example)
-    if example.symbols[0] == "none" or len(example.words) > example.own or _WHOEVER & set(example.words):
-        return example
-    if any(body[1:2] != ["any"] or body[0] == "handover" for body, _ in parts):
+    if not _is_for_whomever(example):
         return example
     crew = _of_kinds(rng) if rng.random() < 0.6 else _by_name(lexicon, rng)
-    count = len(crew.meant)
-    if not count or len(parts) * count > MAX_SUBTASKS:
-        return example
-    if rng.random() < 0.2:
-        before = ()
-        words = (*unended(example), *rng.choice(_PHRASES["crew_behind"]).replace("CREW", crew.called).split())
-    else:
-        before = rng.choice(_PHRASES["crew_calls"]).replace("CREW", crew.called).split()
-        words = (*before, *example.words)
+    words, shift, _ = _called(example, crew.called.split(), rng)
     places = [len(words) + number for number, robot in enumerate(crew.roster) if robot in crew.meant]
+    symbols = _of_each(example, [[f"w{place}", f"w{place}"] for place in places], shift)
+    return Example((*words, *crew.roster), len(words), symbols) if symbols else example
+
+
+def named(example: Example, lexicon: Lexicon, rng: random.Random) -> Example:
+    """Return an order to whomever as one to two to four robots by their names or numbers; any other as it is."""
+    if not _is_for_whomever(example):
+        return example
+    called, names = _in_a_row(rng) if rng.random() < 0.4 else _one_by_one(lexicon, rng)
+    words, shift, at = _called(example, called, rng)
+    pieces = [[f"w{at + each}" if isinstance(each, int) else each for each in name] for name in names]
+    symbols = _of_each(example, pieces, shift)
+    return Example(tuple(words), len(words), symbols) if symbols else example
+
+
+def _is_for_whomever(example: Example) -> bool:
+    if example.symbols[0] == "none" or len(example.words) > example.own or _WHOEVER & set(example.words):
+        return False
+    return all(body[1:2] == ["any"] and body[0] != "handover" for body, _ in subtasks_of(example))
+
+
+def _called(example: Example, crew: Sequence[str], rng: random.Random) -> tuple[list[str], int, int]:
+    """Return an order's words with those it is for, how far its own are moved, and where those of the crew begin."""
+    behind = rng.random() < 0.2
+    said = rng.choice(_PHRASES["crew_behind" if behind else "crew_calls"]).split()
+    first = said.index("CREW")
+    words = [*said[:first], *crew, *said[first + 1 :]]
+    if behind:
+        own = unended(example)
+        return [*own, *words], 0, len(own) + first
+    return [*words, *example.words], len(words), first
+
+
+def _of_each(example: Example, robots: Sequence[Sequence[str]], shift: int) -> tuple[str, ...]:
+    """Return the symbols of an order that each of some robots has; none if that were too many subtasks."""
+    parts, count = subtasks_of(example), len(robots)
+    if not count or len(parts) * count > MAX_SUBTASKS:
+        return ()
     symbols: list[str] = []
     for body, after in parts:
-        rest = [f"w{int(each[1:]) + len(before)}" if re.fullmatch(r"w\d+", each) else each for each in body[2:]]
-        for number, place in enumerate(places, 1):
+        rest = [f"w{int(each[1:]) + shift}" if re.fullmatch(r"w\d+", each) else each for each in body[2:]]
+        for number, robot in enumerate(robots, 1):
             earlier = [str((each - 1) * count + number) for each in after]
-            symbols += ["|", body[0], f"w{place}", f"w{place}", *rest, *(["<", *earlier] if earlier else [])]
-    return Example((*words, *crew.roster), len(words), (example.symbols[0], *symbols[1:]))
+            symbols += ["|", body[0], *robot, *rest, *(["<", *earlier] if earlier else [])]
+    return (example.symbols[0], *symbols[1:])
+
+
+def _in_a_row(rng: random.Random) -> tuple[list[str], list[list[str | int]]]:
+    """Return the words for robots of a kind by their numbers, and the pieces of each name: word numbers and symbols."""
+    low, count = rng.randrange(1, 12), rng.randrange(2, 5)
+    kinds = f"{rng.choice((*_KINDS, *_ANY_KIND))}s"
+    if count > 2 and rng.random() < 0.5:
+        words = [kinds, str(low), *rng.choice(_PHRASES["ranges"]).split(), str(low + count - 1)]
+        between: list[list[str | int]] = [[0, 0, "~", "+", f'"{low + each}"'] for each in range(1, count - 1)]
+        return words, [[0, 0, "~", "+", 1, 1], *between, [0, 0, "~", "+", len(words) - 1, len(words) - 1]]
+    marks = sorted(rng.sample("abcdef", count) if rng.random() < 0.2 else rng.sample("123456789", count))
+    words, places = [kinds], list[int]()
+    for number, mark in enumerate(marks):
+        words += ([","] if number < count - 1 else ["and"]) if number else []
+        places.append(len(words))
+        words.append(mark)
+    return words, [[0, 0, "~", "+", place, place] for place in places]
+
+
+def _one_by_one(lexicon: Lexicon, rng: random.Random) -> tuple[list[str], list[list[str | int]]]:
+    """Return the words for robots by their names, and the pieces of each name."""
+    names = list(dict.fromkeys(lexicon.noun(ROBOT, rng) for _ in range(rng.choice((2, 3, 3, 4)))))
+    words: list[str] = []
+    pieces: list[list[str | int]] = []
+    last = rng.choice(("and", "and", "and", "&", ", and", "plus"))
+    for number, name in enumerate(names):
+        words += ([","] if number < len(names) - 1 else last.split()) if number else []
+        pieces.append([len(words), len(words) + len(name) - 1])
+        words += name
+    return words, pieces
 
 
 def _of_kinds(rng: random.Random) -> _Crew:

@@ -62,6 +62,18 @@ def joined(one: Example, two: Example, rng: random.Random) -> Example | None:
     return None
 
 
+def abreast(one: Example, two: Example, rng: random.Random) -> Example | None:
+    """Return two clauses as one sentence, for different robots side by side: whoever waits for one waits with both."""
+    if not _is_a_clause(one) or not _is_a_clause(two) or "none" in (one.symbols[0], two.symbols[0]):
+        return None
+    firsts, seconds = robots_of(one), robots_of(two)
+    if any(ANY.fullmatch(each) for each in firsts | seconds) or firsts & seconds or not firsts or not seconds:
+        return None
+    if len(one.words) > one.own or len(two.words) > two.own or _count(one) + _count(two) > MAX_SUBTASKS:
+        return None
+    return _linked(one, two, two.symbols, _Link(between=rng.choice(_PHRASES["abreast"])))
+
+
 def _between_others(one: Example, two: Example, rng: random.Random) -> _Link:
     """Return a link between orders to different robots."""
     roll = rng.random()

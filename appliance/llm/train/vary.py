@@ -15,10 +15,10 @@ from msgspec.structs import replace
 
 from appliance.llm.language import values
 from appliance.llm.language.codec import ANY
-from appliance.llm.train.crews import crewed
+from appliance.llm.train.crews import crewed, named
 from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
 from appliance.llm.train.lexicon import Lexicon
-from appliance.llm.train.linking import MAX_WORDS, joined, robots_of
+from appliance.llm.train.linking import MAX_WORDS, abreast, joined, robots_of
 from appliance.llm.train.listing import listed
 from appliance.llm.train.reword import reworded
 
@@ -62,11 +62,15 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
         rng: of everything that is random.
     """
     made = listed(example, rng) if rng.random() < 0.2 else example
+    made = named(made, lexicon, rng) if rng.random() < 0.1 else made
     made = addressed(made, lexicon, rng) if rng.random() < 0.4 else made
     for chance in (0.4, 0.15):
         if others and rng.random() < chance:
             other = rng.choice(others)
-            made = joined(made, addressed(other, lexicon, rng) if rng.random() < 0.6 else other, rng) or made
+            other = addressed(other, lexicon, rng) if rng.random() < 0.6 else other
+            if rng.random() < 0.4:
+                other = abreast(other, addressed(rng.choice(others), lexicon, rng), rng) or other
+            made = joined(made, other, rng) or made
     if rng.random() < 0.6:
         made = reworded(made, rng)
     if rng.random() < 0.8:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from appliance.llm.language.codec import read
 from appliance.llm.language.words import words_of
 from appliance.llm.train.examples import Example, is_exact
-from appliance.llm.train.linking import joined
+from appliance.llm.train.linking import abreast, joined
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
 
@@ -130,3 +130,16 @@ def test_what_would_not_be_clear_is_not_joined() -> None:
     refused = Example(("what", "is", "love"), 3, ("none", "question"))
     for one, two in ((FETCH, group), (FETCH, refused), (refused, FETCH)):
         assert all(joined(one, two, random.Random(seed)) is None for seed in SEEDS)  # noqa: S311 - no secrets
+
+
+def test_who_is_told_in_one_sentence_waits_together() -> None:
+    """Two clauses side by side that follow something both come after it; two sentences are not made one."""
+    lou = example("Lou opens the gate", "manipulation open w0 w0 object: w3 w3")
+    for seed in SEEDS:
+        both = abreast(FILM, lou, random.Random(seed))  # noqa: S311 - no secret
+        assert both is not None
+        assert (after(both, "record_video"), after(both, "open")) == (set(), set())
+        made = joined(FETCH, both, random.Random(seed))  # noqa: S311 - no secret
+        assert made is not None
+        assert after(made, "record_video") == after(made, "open")
+        assert abreast(FETCH, lou, random.Random(seed)) is None  # noqa: S311 - no secret
