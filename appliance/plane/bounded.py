@@ -55,6 +55,10 @@ class BoundedMembership(Membership):
         """Before that nothing it could say of the ring is true."""
         self._contacts: list[str] = []
         self._watched: dict[str, Closer] = {}
+        self._held: dict[str, frozenset[str]] = {}
+        """For whom -> gateways that stay members while their token is seen, whether the view keeps them or not."""
+        self._shown: set[str] = set()
+        """Of those watched, whose token is seen."""
         self._sooner = asyncio.Event()
         self._running: list[asyncio.Task[None]] = []
         rpc.register("ring_next", NextAsk, self._on_next, exchange=False)
@@ -71,6 +75,15 @@ class BoundedMembership(Membership):
         """Whoever asks is there: a bounded view need not know it."""
         del name
         return True
+
+    def hold(self, who: str, names: frozenset[str]) -> None:
+        """Stay aware of these as long as they are there, whether the view keeps them or not."""
+        names -= {self._me}
+        if names != self._held.get(who, frozenset()):
+            self._held[who] = names
+            if not names:
+                del self._held[who]
+            self._follow()
 
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway, as far as it knows without a gap."""
@@ -230,14 +243,14 @@ class BoundedMembership(Membership):
         return lookup.result
 
     def _follow(self) -> None:
-        """Watch the tokens of those in the view, and tell the rest of the plane who came and went."""
-        known = frozenset(self._view.names)
+        """Watch the tokens of those in the view and those held, and tell the rest of the plane who came and went."""
+        view, held = frozenset(self._view.names), frozenset[str]().union(*self._held.values())
+        known = view | (held & self._shown)
         before = self._members - {self._me}
-        for name in before - known:
-            closer = self._watched.pop(name, None)
-            if closer is not None:
-                closer.close()
-        for name in known - self._watched.keys():
+        for name in self._watched.keys() - view - held:
+            self._watched.pop(name).close()
+            self._shown.discard(name)
+        for name in (view | held) - self._watched.keys():
             self._watched[name] = self._session.watch_alive(self._session.keys.alive(name), self._on_token)
         if known == before:
             return
@@ -249,7 +262,13 @@ class BoundedMembership(Membership):
 
     def _on_token(self, key: str, alive: bool) -> None:
         name = key.split("/")[-2]
-        if not alive and name in self._view:
+        if alive:
+            self._shown.add(name)
+        else:
+            self._shown.discard(name)
+        if name not in self._view:
+            self._follow()
+        elif not alive:
             self._upkeep.unreachable(name, self._now())
             self._upkeep.next_at = min(self._upkeep.next_at, self._now() + self._upkeep.interval_s)
             self._sooner.set()

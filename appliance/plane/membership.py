@@ -64,6 +64,9 @@ class Membership:
         """Whether a gateway counts as there for its questions about records."""
         return name in self._members
 
+    def hold(self, who: str, names: frozenset[str]) -> None:
+        """Stay aware of these while they are there, for `who`; none: no more. Nothing to do where all are known."""
+
     def seen_since(self, moment: float) -> frozenset[str]:
         """The other members whose token was there at a moment of the pulse's clock and has never gone since."""
         return frozenset(name for name, at in self._since.items() if at <= moment)

@@ -274,6 +274,18 @@ class Plane:
         """Ids of the gateways that are there, this one among them."""
         return self._membership.members
 
+    def sees(self, name: str) -> bool:
+        """Whether a gateway may be there, as far as this one can tell: with a bounded view any may."""
+        return self._membership.sees(name)
+
+    def hold(self, who: str, names: frozenset[str]) -> None:
+        """Have these gateways count as members for as long as they are there, for `who` (none of them: no more).
+
+        With a bounded view a gateway that is there leaves it now and then, and would be taken for lost; and one that is
+        in nobody's view would not be missed. Where all are known nothing is to do.
+        """
+        self._membership.hold(who, names)
+
     async def holders(self, key: str, n: int) -> tuple[str, ...]:
         """The first `n` gateways from a key's position on, its owner first; UnreachableError when nobody knows."""
         return await self._membership.holders(key, n)

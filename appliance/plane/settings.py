@@ -32,7 +32,8 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     view: Literal["full"] | int = "full"
     """`full`: every gateway knows every other, a lookup is one hop; right to about 1,000. A number: each knows so many
     (4·log2 N is plenty), looks up hop by hop and has one point on the ring; the same in the whole fleet. Records work
-    so; placing of tasks and finding of containers still look among the gateways known."""
+    so; placing of tasks and finding of containers still look among the gateways known, and whoever has a run of a task
+    stays known to its coordinator."""
     find_successors: int = 5
     """How many successors of hash(image) are asked for containers (paper: k = 5)."""
     lease_ms: int = 1000

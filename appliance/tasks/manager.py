@@ -266,7 +266,7 @@ class TaskManager:
     def _on_run_event(self, key: str, event: RunEvent | None) -> None:
         if event is None or (driver := self._drivers.get(event.task)) is None:
             return
-        if not key.endswith(f"/task/{event.task}/run/{event.subtask}") or event.gateway not in self.plane.members():
+        if not key.endswith(f"/task/{event.task}/run/{event.subtask}") or not self.plane.sees(event.gateway):
             self.plane.session.refuse("forged run event", key=key, reason=f"from {clean(event.gateway, 80)!r}")
             return
         driver.tell(RunNews(event))

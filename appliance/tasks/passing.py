@@ -137,7 +137,7 @@ class Passing:
             return await self._plane.rpc.call(there, verb, ask, RunStatus, timeout_s=PASSED_ON_S)
         except SwiftbotError as error:
             log.info("no word of a run that was passed on", run=run_id, gateway=there, reason=str(error))
-            return RunStatus(running=there in self._plane.members())
+            return RunStatus(running=self._plane.sees(there))
 
 
 def whereabouts(request: RunRequest, accepted: RunAccepted) -> RunEvent:
