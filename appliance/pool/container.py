@@ -12,14 +12,14 @@ import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import structlog
 
 from appliance.errors import DeadlineError, PayloadError, PoolError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState
-from appliance.pool.runner.frames import BYTES_TAG, Decoder, FrameError, encode, parse
+from appliance.pool.runner.frames import BYTES_TAG, Decoder, FrameError, encode, untagged
 
 log = structlog.get_logger(__name__)
 
@@ -30,8 +30,18 @@ _TAG = BYTES_TAG.encode()
 
 
 def _parse(body: bytes) -> Any:
-    """Read a frame's JSON: some five times as quick as the runner's own reader, which alone knows of bytes in it."""
-    return parse(body) if _TAG in body else msgspec.json.decode(body)
+    """Read a frame's JSON: some five times as quick as the runner's own reader, and no NaN or broken text passes."""
+    value = msgspec.json.decode(body)
+    return _with_bytes(value) if _TAG in body else value
+
+
+def _with_bytes(value: Any) -> Any:
+    """Return a value with the bytes that are tagged in it."""
+    if isinstance(value, dict):
+        return untagged({key: _with_bytes(each) for key, each in cast("dict[str, Any]", value).items()})
+    if isinstance(value, list):
+        return [_with_bytes(each) for each in cast("list[Any]", value)]
+    return value
 
 
 class Connection:

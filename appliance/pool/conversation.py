@@ -67,7 +67,11 @@ def order(request: RunRequest) -> Frame:
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else 0.0
+    """Return what a handler may have written in a number's place as one; 0 for what is none, or beyond all bounds."""
+    try:
+        return float(value) if isinstance(value, int | float) else 0.0
+    except OverflowError:
+        return 0.0
 
 
 def _table(value: Any) -> dict[str, Any]:
@@ -164,7 +168,9 @@ class Conversation:
     async def _take(self, frame: Frame) -> RunEvent | None:
         match frame.get("ev"):
             case "started":
-                self._started_ns = int(_number(frame.get("at"))) or time.monotonic_ns()
+                at_ns, now_ns = int(_number(frame.get("at"))), time.monotonic_ns()
+                # One clock for all on this machine; a handler could say anything.
+                self._started_ns = at_ns if self._entered_ns <= at_ns <= now_ns else now_ns
                 startup_ms = (self._started_ns - self._entered_ns) / 1e6
                 self._on_event(self.event(RunEventKind.STARTED, startup_ms=startup_ms))
             case "progress":

@@ -134,6 +134,8 @@ def run(ctx):
         return [1]
     if do == "nan":
         return {{"x": float("nan")}}
+    if do == "no text":
+        return {{"x": os.fsdecode(b"caf\\xe9")}}
     if do == "large checkpoint":
         ctx.checkpoint({{"x": "y" * 2**21}})
     if do == "garbage":
@@ -247,6 +249,7 @@ async def _next_run_works(bench: Bench, pool: Pool) -> RunEvent:
         ("class", "skill", "object cannot be sent"),
         ("list", "skill", "returned list, not a dict"),
         ("nan", "skill", "Out of range float"),
+        ("no text", "skill", "surrogates not allowed"),
         ("large checkpoint", "payload", "262144 allowed"),
         ("close", "crashed", "no result"),
         ("garbage", "payload", "garbage"),

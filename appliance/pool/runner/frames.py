@@ -27,20 +27,27 @@ def _pack(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be sent: use dict, list, str, numbers, bool, None or bytes")
 
 
-def _unpack(value: dict[str, Any]) -> Any:
+def untagged(value: dict[str, Any]) -> Any:
+    """Return the bytes that an object stands for, or itself where it stands for none; ValueError for a broken one."""
     if len(value) == 1 and isinstance(value.get(BYTES_TAG), str):
         return base64.b64decode(value[BYTES_TAG], validate=True)
     return value
 
 
-def encode(value: dict[str, Any]) -> bytes:
+def encode(value: dict[str, Any], *, lenient: bool = False) -> bytes:
     """Return the frame of one object.
 
+    Args:
+        value: the object.
+        lenient: what is no Unicode in its texts (half of a surrogate pair, as in names of files that are not UTF-8)
+            becomes a question mark: for what people read.
+
     Raises:
-        TypeError, ValueError: it holds something JSON cannot say (a class, NaN).
+        TypeError, ValueError: it holds something JSON cannot say (a class, NaN, text that is no Unicode).
         FrameError: it is longer than MAX_FRAME.
     """
-    body = json.dumps(value, default=_pack, allow_nan=False, separators=(",", ":")).encode()
+    text = json.dumps(value, default=_pack, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    body = text.encode(errors="replace" if lenient else "strict")
     if len(body) > MAX_FRAME:
         raise FrameError(f"frame of {len(body)} bytes, {MAX_FRAME} allowed")
     return len(body).to_bytes(4, "big") + body
@@ -48,7 +55,7 @@ def encode(value: dict[str, Any]) -> bytes:
 
 def parse(body: bytes) -> Any:
     """Return the value of a frame's JSON; ValueError when it is none."""
-    return json.loads(body, object_hook=_unpack)
+    return json.loads(body, object_hook=untagged)
 
 
 class Decoder:

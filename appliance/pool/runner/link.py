@@ -91,8 +91,8 @@ class Link:
                 raise Cancelled
 
     def send(self, frame: Frame) -> None:
-        """Send one frame whole; Cancelled when the gateway is gone."""
-        self.send_encoded(encode(frame))
+        """Send one frame whole, what is no Unicode in it replaced; Cancelled when the gateway is gone."""
+        self.send_encoded(encode(frame, lenient=True))
 
     def send_encoded(self, data: bytes) -> None:
         """Send one frame that is encoded already."""
@@ -121,7 +121,7 @@ class Link:
         with self._asking:
             self._count += 1
             number = self._count
-            self.send({"ev": "call", "n": number, "name": name, "args": args})
+            self.send_encoded(encode({"ev": "call", "n": number, "name": name, "args": args}))
             while True:
                 reply = self._receive()
                 if reply.get("n") != number:

@@ -228,7 +228,7 @@ def _rehearse(loaded: Loaded) -> dict[str, str]:
 
 
 def _tell(fd: int, line: str) -> None:
-    os.write(fd, line.replace("\n", " ").encode()[:2000] + b"\n")
+    os.write(fd, line.replace("\n", " ").encode(errors="replace")[:2000] + b"\n")
 
 
 def _attend(fd: int, pid: int, problems: dict[str, str]) -> tuple[str, str]:

@@ -143,7 +143,7 @@ class Zygote:
 
     def _send(self, peer: socket.socket, frame: Frame) -> bool:
         """Send without ever waiting: a gateway that does not read its few replies has lost them."""
-        data = encode(frame)
+        data = encode(frame, lenient=True)
         try:
             return peer.send(data, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL) == len(data)
         except OSError:

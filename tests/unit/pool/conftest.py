@@ -113,6 +113,20 @@ def run(ctx):
         return {"x": object()}
     if do == "nan":
         return {"x": float("nan")}
+    if do == "no text":
+        name = os.fsdecode(b"caf\\xe9")
+        where = ctx.params["where"]
+        if where == "people":
+            ctx.progress(0.5, name)
+            ctx.log(name, file=name)
+            return {"whole": 2**70, "text": "caf\\u00e9"}
+        if where == "result":
+            return {"x": name}
+        if where == "checkpoint":
+            ctx.checkpoint({"x": name})
+        if where == "call":
+            ctx.put_artifact(name, b"x")
+        raise FileNotFoundError(2, "No such file", name)
     if do == "flood":
         for number in range(40000):
             print("line", number)

@@ -146,6 +146,26 @@ async def test_bad_handlers(zygote: Zygote, do: str, code: str, text: str, retry
     assert (await _run(zygote, "echo"))[-1]["ev"] == "result"
 
 
+@pytest.mark.parametrize(
+    ("where", "code", "text"),
+    [
+        ("result", "skill", "surrogates not allowed"),
+        ("checkpoint", "skill", "surrogates not allowed"),
+        ("call", "skill", "surrogates not allowed"),
+        ("error", "skill", "No such file: 'caf"),
+    ],
+)
+async def test_text_that_is_none(zygote: Zygote, where: str, code: str, text: str) -> None:
+    """The name of a file that is not UTF-8 is refused where it counts, and for people it is made readable."""
+    frames = await _run(zygote, "no text", params={"where": where})
+    assert [frame["ev"] for frame in frames] == ["started", "error"]
+    assert frames[-1]["code"] == code
+    assert text in frames[-1]["message"]
+    frames = await _run(zygote, "no text", params={"where": "people"})
+    assert [frame.get("note") or frame.get("text") for frame in frames[1:-1]] == ["caf?", "caf?"]
+    assert frames[-1]["result"] == {"whole": 2**70, "text": "café"}
+
+
 async def test_cancel_lets_the_handler_clean_up(zygote: Zygote) -> None:
     """A cancelled handler sees Cancelled, may still talk, and its run ends as cancelled."""
     connection, control = await zygote(), await zygote()
