@@ -11,10 +11,11 @@ a confidence; it may have `evidence.bin`.
 
 import heapq
 import itertools
+import json
 import math
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -95,8 +96,10 @@ class Turn:
 
     at: int
     """Symbols before it."""
-    symbol: str
-    token: int
+    tokens: tuple[int, ...]
+    """Those of the symbols before it."""
+    symbols: tuple[str, ...]
+    """What may begin with that token: one, or several literals."""
     cost: float
     """Negative logarithm of the probability of all up to and with it."""
     share: float
@@ -183,10 +186,10 @@ class Speaker:
             other = guide()
             for symbol in trunk.symbols[: turn.at]:
                 other.take(symbol)
-            begun = Spoken(symbols=trunk.symbols[: turn.at], tokens=trunk.tokens[: turn.at], cost=turn.cost)
+            begun = Spoken(symbols=trunk.symbols[: turn.at], tokens=list(turn.tokens), cost=turn.cost)
             self._voices.say(begun.tokens)
             try:
-                if self._taken(other, begun, turn.symbol, turn.token):
+                if self._taken(other, begun, turn.symbols):
                     self._followed(other, begun, min(most, turn.at + left), check)
                 paths.append(begun)
             except TooLongError:
@@ -215,31 +218,65 @@ class Speaker:
         """Go on with an answer to its end, by the likeliest symbol each time."""
         while True:
             check()
-            allowed = [(each, token) for each in guide.allowed() if (token := self._token(each)) is not None]
-            if not allowed or len(path.symbols) > most:
+            groups: dict[int, list[str]] = {}
+            """What may come, by the token that it begins with: literals begin alike."""
+            for each in guide.allowed():
+                if (token := self._begin(each)) is not None:
+                    groups.setdefault(token, []).append(each)
+            if not groups or len(path.symbols) > most:
                 raise TooLongError(f"no end after {len(path.symbols)} symbols")
+            allowed = list(groups)
             best = 0
             if len(allowed) > 1:
-                values = self._voices.likely([token for _, token in allowed])
+                values = self._voices.likely(allowed)
                 order = sorted(range(len(values)), key=values.__getitem__, reverse=True)
                 best, second = order[:2]
                 total = values[best] + math.log(sum(math.exp(value - values[best]) for value in values))
-                symbol, token = allowed[second]
                 against = total - values[second]
-                path.turns.append(Turn(len(path.symbols), symbol, token, path.cost + against, math.exp(-against)))
+                path.turns.append(
+                    Turn(
+                        at=len(path.symbols),
+                        tokens=tuple(path.tokens),
+                        symbols=tuple(groups[allowed[second]]),
+                        cost=path.cost + against,
+                        share=math.exp(-against),
+                    )
+                )
                 path.cost += total - values[best]
-            if not self._taken(guide, path, *allowed[best]):
+            if not self._taken(guide, path, groups[allowed[best]]):
                 return path
 
-    def _taken(self, guide: Guide, path: "Spoken", symbol: str, token: int) -> bool:
-        """Take a symbol; whether the answer goes on."""
+    def _taken(self, guide: Guide, path: "Spoken", symbols: Sequence[str]) -> bool:
+        """Take a symbol, or the likeliest of some literals; whether the answer goes on."""
+        symbol = symbols[0]
+        if symbol[:1] == '"':
+            symbol = self._literal_said(path, symbols)
         guide.take(symbol)
         if guide.ended:
             return False
         path.symbols.append(symbol)
-        path.tokens.append(token)
-        self._voices.go_on(token)
+        if symbol[:1] != '"':
+            token = self._card.tokens[symbol]
+            path.tokens.append(token)
+            self._voices.go_on(token)
         return True
+
+    def _literal_said(self, path: "Spoken", symbols: Sequence[str]) -> str:
+        """Say the likeliest of some literals token by token, and return it."""
+        left = {each: self._voices.literal(json.loads(each)) for each in symbols}
+        said = 0
+        while any(len(tokens) > said for tokens in left.values()):
+            tokens = list(dict.fromkeys(each[said] for each in left.values()))
+            best = 0
+            if len(tokens) > 1:
+                values = self._voices.likely(tokens)
+                best = max(range(len(values)), key=values.__getitem__)
+                path.cost += math.log(sum(math.exp(value - values[best]) for value in values))
+            left = {symbol: each for symbol, each in left.items() if each[said] == tokens[best]}
+            path.tokens.append(tokens[best])
+            self._voices.go_on(tokens[best])
+            said += 1
+        return next(iter(left))
 
     def _confidence(self, against: float) -> float:
         """Return how sure an answer is whose probability is exp(-against), calibrated on held-out instructions."""
@@ -247,7 +284,10 @@ class Speaker:
         slope, offset = self._card.calibration
         return 1 / (1 + math.exp(-max(-60.0, min(60.0, slope * math.log(share / (1 - share)) + offset))))
 
-    def _token(self, symbol: str) -> int | None:
+    def _begin(self, symbol: str) -> int | None:
+        """Return the token that a symbol begins with; None for one that the planner does not know."""
+        if symbol[:1] == '"':
+            return self._card.tokens.get("<literal>")
         return self._card.tokens.get("<end>" if symbol == END else symbol)
 
 

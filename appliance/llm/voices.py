@@ -83,6 +83,11 @@ class Voice:
             raise TooLongError(f"{len(found)} tokens, more than the planner's {self._context} leave room for")
         return found
 
+    def literal(self, text: str) -> list[int]:
+        """Return the tokens of a text that is said and not pointed at."""
+        mark = self._tokens["<literal>"]
+        return [mark, *self._cut(f"'{text}"), mark]
+
     @property
     def prompt(self) -> int:
         """Tokens of the prompt."""
@@ -134,6 +139,10 @@ class Voices:
         """Return how likely tokens are to come next, as logarithms up to a number that is the same for all."""
         each = [voice.likely(tokens) for voice in self._voices]
         return [sum(values) / len(values) for values in zip(*each, strict=True)]
+
+    def literal(self, text: str) -> list[int]:
+        """Return the tokens of a text that is said and not pointed at."""
+        return self._voices[0].literal(text)
 
     def go_on(self, token: int) -> None:
         """Take a token as said."""

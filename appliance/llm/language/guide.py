@@ -1,10 +1,11 @@
 """Which symbols may come next: an answer that follows the guide is a plan over the catalogue, and over these words.
 
 A planner that is held to it cannot be anything else: no skill, parameter or robot that is not there, no edge to a later
-subtask, nothing required left out, no number where words are none, and no name that was not said (literals are not
-offered). What a plan may be beyond that is for validation.
+subtask, nothing required left out, no number where words are none, and no name that was not said (literals are offered
+only as a part of a name, and only those between the ends of a range). What a plan may be beyond that is for validation.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 
 from msgspec import Struct
@@ -12,6 +13,7 @@ from msgspec import Struct
 from appliance.llm.language import values
 from appliance.llm.language.codec import JOINT, OPERATOR, has_robot, is_number
 from appliance.llm.language.plurals import singular
+from appliance.llm.language.ranges import between
 from appliance.llm.language.words import Words
 from appliance.skills.catalogue import Catalogue
 
@@ -83,6 +85,8 @@ class Guide:
         self._robots = None if robots is None else frozenset(robots)
         self._runs: dict[str, dict[int, list[int]]] = {}
         """Of a kind of value: first word -> last words, where the run means one."""
+        self._between = tuple(json.dumps(each) for each in between(words))
+        """Literals that may be a part of a name."""
         self._state = "start"
         self._number = 0
         self._skill = ""
@@ -115,6 +119,8 @@ class Guide:
                 self._begin_subtask(symbol)
             case "robot" | "item":
                 self._take_value(symbol)
+            case "piece" if symbol[0] == '"':
+                self._take_literal(str(json.loads(symbol)))
             case "piece":
                 self._first, self._state = int(symbol[1:]), "last"
             case "last":
@@ -141,7 +147,7 @@ class Guide:
 
     def may_be_first(self) -> list[str]:
         """Return the words with which a piece may begin."""
-        return [f"w{first}" for first in self._runs_here()]
+        return [*(f"w{first}" for first in self._runs_here()), *self._literals_here()]
 
     def may_be_last(self) -> list[str]:
         """Return the words with which the piece may end."""
@@ -261,6 +267,20 @@ class Guide:
         self._listed += self._listed >= 0 and self._pieces == 1
         self._state = "said"
 
+    def _take_literal(self, text: str) -> None:
+        self._pieces += 1
+        self._said = f"{self._said} {text}"
+        self._plural = False
+        self._state = "said"
+
+    def _literals_here(self) -> list[str]:
+        """Return the literals that may come as the next piece of a name; none may be its first."""
+        if not self._pieces or not self._between:
+            return []
+        if not self._is_robot() or self._robots is None:
+            return list(self._between)
+        return [each for each in self._between if _id(f"{self._said} {json.loads(each)}") in self._robots]
+
     def after_value(self) -> list[str]:
         """Return what may follow a value or a robot."""
         found: list[str] = []
@@ -289,7 +309,8 @@ class Guide:
         if not self._is_robot() or self._robots is None:
             return True
         begun = _id(said) + "_"
-        return any(robot.startswith(begun) for robot in self._robots) and bool(self._completions(begun))
+        begins = any(robot.startswith(begun) for robot in self._robots)
+        return begins and bool(self._completions(begun) or self._literals_here())
 
     def _completions(self, begun: str) -> dict[int, list[int]]:
         robots = self._robots or frozenset()

@@ -8,7 +8,7 @@ import msgspec
 
 from appliance.llm.language.words import MAX_WORDS
 from appliance.llm.speaking import CARD, Card
-from appliance.llm.train.tokens import BEGIN, END, PLAN, ROSTER, Tokens, symbols_of
+from appliance.llm.train.tokens import BEGIN, END, LITERAL, PLAN, ROSTER, Tokens, symbols_of
 from appliance.skills.catalogue import Catalogue
 
 
@@ -16,7 +16,7 @@ def card_of(
     tokens: Tokens, catalogue: Catalogue, *, calibration: tuple[float, float] = (1.0, 0.0), twice: bool = False
 ) -> Card:
     """Return the card of a tokenizer, and of a model that reads instructions twice or once."""
-    found = {each: tokens.of(each) for each in (BEGIN, END, ROSTER, PLAN)}
+    found = {each: tokens.of(each) for each in (BEGIN, END, ROSTER, PLAN, LITERAL)}
     found |= {f"w{number}": tokens.of(f"<w{number}>") for number in range(MAX_WORDS)}
     found |= {symbol: tokens.of(f"<{symbol}>") for symbol in symbols_of(catalogue)}
     return Card(language=1, tokens=found, calibration=calibration, twice=twice)

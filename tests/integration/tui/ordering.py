@@ -68,7 +68,6 @@ async def confirm(ann: Operator, *words: str) -> None:
 
 async def proposed(ann: Operator, client: FleetClient, instruction: str = TOUR) -> TaskRecord:
     """Submit an instruction for review; its record once the plan waits and is looked at."""
-    known = set(ann.store.tasks)
     await ann.press("s")
     await ann.see("What shall the robots do?")
     await ann.write(instruction)
@@ -76,7 +75,8 @@ async def proposed(ann: Operator, client: FleetClient, instruction: str = TOUR) 
     await ann.see("Enter runs this plan")
     await ann.press("f2")
     await ann.until(lambda: isinstance(ann.app.screen, ReviewScreen))
-    (task,) = set(ann.store.tasks) - known
-    record = await record_of(client, task, lambda record: record.state is TaskState.PROPOSED)
+    screen = ann.app.screen
+    assert isinstance(screen, ReviewScreen)
+    record = await record_of(client, screen.task_id, lambda record: record.state is TaskState.PROPOSED)
     await ann.see("waits for approval", "goto")
     return record
