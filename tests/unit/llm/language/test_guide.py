@@ -10,6 +10,7 @@ from appliance.llm import corpus
 from appliance.llm.corpus.notation import parse
 from appliance.llm.language.codec import Answer, read, write
 from appliance.llm.language.guide import END, Guide, shapes
+from appliance.llm.language.ranges import between
 from appliance.llm.language.words import words_of
 from appliance.skills.catalogue import load_catalogue
 
@@ -19,6 +20,7 @@ FILES = sorted(Path(corpus.__file__).parent.glob("*.plan"))
 INSTRUCTIONS = (
     "Rex, fetch the drill from bay two and film it for half a minute.",
     "robots 1 and 2 meet at dock 3",
+    "robots 1 to 3 close doors 4 through 7",
     "what is love",
     "?",
     "stop",
@@ -52,15 +54,33 @@ def test_whatever_follows_it_is_a_plan(data: st.DataObject, instruction: str, ro
             assert subtask.robot in robots
 
 
+def test_a_range_has_all_between_its_ends_and_a_roster_still_decides() -> None:
+    """A name may go on with a number that is meant and not said, not begin with one; a robot is of the roster."""
+    words = words_of("robots 1 to 4 close doors 5 to 8", ("robot_1", "robot_2", "robot_4"))
+    guide = Guide(words, SKILLS, robots=("robot_1", "robot_2", "robot_4"))
+    for symbol in ("manipulation", "close", "w0", "w0", "~", "+"):
+        assert symbol in guide.allowed()
+        guide.take(symbol)
+    assert [each for each in guide.allowed() if each.startswith('"')] == ['"2"']
+    for symbol in ('"2"', "object:"):
+        guide.take(symbol)
+    assert not any(each.startswith('"') for each in guide.allowed())
+    for symbol in ("w5", "w5", "~", "+"):
+        guide.take(symbol)
+    assert {'"6"', '"7"'} <= set(guide.allowed())
+    guide.take('"6"')
+    assert END in guide.allowed()
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
 def test_the_corpus_follows_it(file: Path) -> None:
-    """The plans of the corpus (each third) that need no literal may be said, with the roster they have."""
+    """The plans of the corpus (each third) may be said, but those that need a literal that no range has."""
     for pair in list(parse(file.read_text()).values())[::3]:
         words = words_of(pair.instruction, pair.robots)
         answer = Answer(domain=pair.domain, subtasks=pair.subtasks, refused=pair.refused)
         symbols = write(answer, words, CATALOGUE)
-        if any(each.startswith('"') for each in symbols):
+        if {each for each in symbols if each.startswith('"')} - {f'"{each}"' for each in between(words)}:
             continue
         guide = Guide(words, SKILLS, robots=pair.robots or None)
         for symbol in (*symbols, END):
