@@ -28,7 +28,7 @@ PARTS = ("hops", "join", "failures", "traffic")
 _KEYS = 100_000
 _MANY = 1000
 _FAILING = 1000
-"""Besides the largest ring the one that failures are counted for."""
+"""Besides the largest ring the one that failures are counted for by all lengths of the successor list."""
 _SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
 
 Progress = Callable[[str], None]
@@ -46,7 +46,8 @@ def run(
     """Run these parts for these ring sizes.
 
     Args:
-        sizes: Members of the rings; failures are counted for those of 1,000 and for the largest.
+        sizes: Members of the rings; failures are counted for all with the list of successors that grows with the ring,
+            for those of 1,000 and for the largest with others too.
         lookups: Lookups behind each figure.
         seconds: Simulated time of each figure of traffic, after as long to settle; half of it beyond 1,000 members.
         seed: Of everything drawn.
@@ -80,11 +81,11 @@ def _jobs(size: int, largest: int, lookups: int, seconds: float, seed: int) -> l
             "traffic", size, partial(bytes_sent, size, seconds=for_s, settle_s=seconds, lookups=lookups // 4, seed=seed)
         ),
     ]
-    if size in (_FAILING, largest):
-        jobs += [
-            _Job("failures", size, partial(failures, size, lookups=lookups, seed=seed, lengths=(length,)))
-            for length in successor_lengths(size)
-        ]
+    grown = successor_count(size, view_bound(size))
+    jobs += [
+        _Job("failures", size, partial(failures, size, lookups=lookups, seed=seed, lengths=(length,)))
+        for length in (successor_lengths(size) if size in (_FAILING, largest) else (grown,))
+    ]
     return jobs
 
 

@@ -87,8 +87,8 @@ class Upkeep:
         """Member -> questions in a row that it has not answered in time."""
         self._newest: list[str] = []
         self._turn = 0
-        self._finger = rng.randrange(view.bound)
-        """Number of the finger looked up last; the first is drawn, so that not all members begin with the nearest."""
+        self._finger = view.origin % view.bound
+        """Number of the finger looked up last; not all members begin with the same one."""
         self._first: list[str] = []
         """To be met before all others, the last first: a joiner's neighbours; members that their neighbour left out."""
 

@@ -51,9 +51,10 @@ def test_all_parts_on_several_processes() -> None:
     found = simulation.run((16, 40), lookups=40, seconds=3.0, seed=2, progress=told.append)
     for part in ("hops", "join", "traffic"):
         assert list(found[part]) == ["16", "40"]
-    assert found["failures"] == {"40": simulation.failures(40, lookups=40, seed=2)}
+    grown = simulation.failures(16, lookups=40, seed=2, lengths=(simulation.successor_count(16, 16),))
+    assert found["failures"] == {"16": grown, "40": simulation.failures(40, lookups=40, seed=2)}
     assert found["hops"]["40"] == simulation.hops(40, lookups=40, seed=2)
-    assert len(told) == 6 + len(simulation.successor_lengths(40))
+    assert len(told) == 7 + len(simulation.successor_lengths(40))
 
 
 def test_parts_can_be_chosen() -> None:
