@@ -172,7 +172,8 @@ class Plane:
         Two of one name can meet although each found it free: they began at one moment, or on two sides of a cut. By
         then a copy of each record that is here is with the others, who can ask only one of the two for what it has.
         """
-        await self.registry.displaced.wait()
+        if self.registry.namesakes is not None:
+            await self.registry.namesakes.displaced.wait()
         try:
             async with asyncio.timeout(GIVE_S):
                 await self._reconciler.give_all()

@@ -20,7 +20,7 @@ from appliance.errors import SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
 from appliance.plane.facts import Facts, FactsAsk, Known
 from appliance.plane.membership import Membership
-from appliance.plane.namesake import Namesake
+from appliance.plane.namesake import Namesakes
 from appliance.plane.roster import Roster
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
@@ -79,10 +79,10 @@ class Registry:
         """What those gateways that decide anything say is asked for."""
         self._doubted: dict[str, float] = {}
         self._speaker: Speaker | None = None
-        self._namesake = Namesake() if gateway is not None else None
-        self.displaced = asyncio.Event()
-        """Another process goes by this gateway's id, and this one has to go."""
+        self.namesakes: Namesakes | None = None
+        """Others that go by this gateway's id."""
         if gateway is not None:
+            self.namesakes = Namesakes(session, gateway, own=lambda: self.gateways.get(gateway))
             rpc.register("facts", FactsAsk, self._on_facts, exchange=False)
             self._speaker = Speaker(
                 session, gateway, least_s=config.coalesce_ms / 1e3, most_s=config.coalesce_most_ms / 1e3,
@@ -205,8 +205,8 @@ class Registry:
 
     def _on_status(self, key: str, status: GatewayStatus | None) -> None:
         gateway = key.split("/")[-2]
-        if gateway == self._gateway and status is not None:
-            self._on_own(status)
+        if gateway == self._gateway and status is not None and self.namesakes is not None:
+            self.namesakes.heard(status)
         if gateway == self._gateway or status is None or not self._is_member(gateway):
             return
         if status.id != gateway:
@@ -214,17 +214,6 @@ class Registry:
             return
         self._count(gateway)
         self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
-
-    def _on_own(self, status: GatewayStatus) -> None:
-        """What is told under this gateway's name: by itself, or by another that goes by it."""
-        if self._namesake is None or not self._namesake.heard(
-            status, self.gateways.get(self._gateway or ""), time.monotonic()
-        ):
-            return
-        ends = ", ".join(status.endpoints) or "no endpoint"
-        self._session.refuse("another gateway with this id", says=status.id, its_pid=status.pid, listens_on=ends)
-        if self._namesake.goes:
-            self.displaced.set()
 
     def _learn_status(self, gateway: str, status: GatewayStatus, *, age_s: float) -> None:
         self.gateways[gateway] = status
@@ -409,6 +398,8 @@ class Registry:
         for closer in (*self._closers, *(each for both in self._of_member.values() for each in both)):
             closer.close()
         await self._roster.close()
+        if self.namesakes is not None:
+            await self.namesakes.close()
         tasks = [each for each in (self._catching_up, *self._asking.values()) if each is not None]
         for task in tasks:
             task.cancel()

@@ -15,7 +15,7 @@ from appliance.errors import ConflictError, PayloadError
 from appliance.model import GatewayStatus, encode
 from appliance.plane.messages import Found, KeyAsk, StoreAsk
 from appliance.plane.node import Plane
-from appliance.plane.session import Session
+from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.versions import Record, descends
 
@@ -115,6 +115,31 @@ async def test_gateways_of_one_id_that_meet_later_are_told_apart(
             # The one that stays hears of what the other had at its next comparison.
             while await third.dht.read(f"task/{number}") is None:
                 await asyncio.sleep(0.05)
+
+
+async def test_a_status_that_nobody_answers_for_displaces_nobody(
+    tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Statuses of another process, as a program that plays a log puts them: its key is asked, and only it answers."""
+    async with _planes(tmp_path, free_ports(2), "f") as (one, other):
+        asked, query_all = asyncio.Event(), one.session.query_all
+
+        async def noted(expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
+            answers = await query_all(expr, payload, timeout_s=timeout_s)
+            assert len(answers) == 1
+            asked.set()
+            return answers
+
+        monkeypatch.setattr(one.session, "query_all", noted)
+        one.registry.publish_status(GatewayStatus(id="g0", fleet="f", started_ns=2, pid=2))
+        while not asked.is_set():
+            status = GatewayStatus(id="g0", fleet="f", started_ns=1, pid=1)
+            other.session.put(other.keys.status("g0"), encode(status))
+            await asyncio.sleep(0.1)
+        await _until(lambda: one.registry.namesakes is not None and one.registry.namesakes._asking is None)
+        assert one.registry.namesakes is not None
+        assert not one.registry.namesakes.displaced.is_set()
+        assert not one.session.refused
 
 
 @pytest.mark.parametrize("hours", [1, -1])
