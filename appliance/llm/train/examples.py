@@ -110,6 +110,15 @@ def substitute(example: Example, runs: Sequence[tuple[int, int, Sequence[str]]])
     return Example(tuple(words), own, tuple(symbols))
 
 
+def inserted(example: Example, at: int, words: Sequence[str]) -> Example:
+    """Return an instruction with words put in before one of its own, or behind the last."""
+    symbols = tuple(
+        f"w{int(each[1:]) + (len(words) if int(each[1:]) >= at else 0)}" if re.fullmatch(r"w\d+", each) else each
+        for each in example.symbols
+    )
+    return Example((*example.words[:at], *words, *example.words[at:]), example.own + len(words), symbols)
+
+
 def pointed(example: Example) -> frozenset[int]:
     """Return the numbers of all words that a plan points at."""
     return frozenset(number for span in spans(example) for number in range(span.first, span.last + 1))

@@ -64,7 +64,7 @@ def joined(one: Example, two: Example, rng: random.Random) -> Example | None:
 
 def abreast(one: Example, two: Example, rng: random.Random) -> Example | None:
     """Return two clauses as one sentence, for different robots side by side: whoever waits for one waits with both."""
-    if not _is_a_clause(one) or not _is_a_clause(two) or "none" in (one.symbols[0], two.symbols[0]):
+    if not is_a_clause(one) or not is_a_clause(two) or "none" in (one.symbols[0], two.symbols[0]):
         return None
     firsts, seconds = robots_of(one), robots_of(two)
     if any(ANY.fullmatch(each) for each in firsts | seconds) or firsts & seconds or not firsts or not seconds:
@@ -72,6 +72,11 @@ def abreast(one: Example, two: Example, rng: random.Random) -> Example | None:
     if len(one.words) > one.own or len(two.words) > two.own or _count(one) + _count(two) > MAX_SUBTASKS:
         return None
     return _linked(one, two, two.symbols, _Link(between=rng.choice(_PHRASES["abreast"])))
+
+
+def then_linked(one: Example, two: Example, between: str) -> Example:
+    """Return two orders as one, the second of which waits for all of the first."""
+    return _linked(one, two, two.symbols, _Link(between=between, awaited=_lasts(one.symbols)))
 
 
 def _between_others(one: Example, two: Example, rng: random.Random) -> _Link:
@@ -87,7 +92,7 @@ def _between_others(one: Example, two: Example, rng: random.Random) -> _Link:
 def _in_order(one: Example, rng: random.Random) -> _Link:
     """Return a link by which one of two is over before the other begins."""
     if rng.random() < 0.15:
-        return _Link(between=rng.choice(_PHRASES["beforehand" if _is_a_clause(one) else "before_all"]), late=True)
+        return _Link(between=rng.choice(_PHRASES["beforehand" if is_a_clause(one) else "before_all"]), late=True)
     lasts = _lasts(one.symbols)
     several = len(lasts) > 1 and len(robots_of(one)) > 1
     return _Link(between=rng.choice(_PHRASES["joining" if several else "then"]), awaited=lasts)
@@ -109,12 +114,12 @@ def _waiting(one: Example, two: Example, rng: random.Random) -> _Link | None:
         words = rng.choice(_PHRASES[of if len(awaited) == 1 else f"{of}_two"]).split()
         return " ".join(names.get(each, each) for each in words)
 
-    if _is_a_clause(two) and rng.random() < 0.45:
+    if is_a_clause(two) and rng.random() < 0.45:
         return _Link(between=rng.choice(_PHRASES["beside"]), after=choose("until"), awaited=sorted(numbers))
     return _Link(between=choose("awaiting"), awaited=sorted(numbers))
 
 
-def _is_a_clause(example: Example) -> bool:
+def is_a_clause(example: Example) -> bool:
     """Whether what is said of it, or after it, can only be meant of the whole."""
     own = list(example.words[: example.own])
     while own and _MARK.fullmatch(own[-1]):

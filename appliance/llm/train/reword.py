@@ -41,7 +41,7 @@ def _third(verb: str) -> str:
     return f"{verb}es" if verb.endswith(("s", "x", "z", "ch", "sh", "o")) else f"{verb}s"
 
 
-def _going_on(verb: str) -> str:
+def going_on(verb: str) -> str:
     """Return the form of "while photographing"."""
     if verb in _DOUBLED:
         return _DOUBLED[verb]
@@ -54,7 +54,7 @@ def _forms(words: Phrase) -> Iterator[Phrase | None]:
     its = ["its" if each == "your" else each for each in rest]
     yield words
     yield None if "and" in rest else (_third(verb), *its)
-    yield None if "and" in rest else (_going_on(verb), *its)
+    yield None if "and" in rest else (going_on(verb), *its)
 
 
 def _others(words: Sequence[str], only: Sequence[str], *, verb: bool) -> Others:

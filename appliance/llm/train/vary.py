@@ -16,13 +16,14 @@ from msgspec.structs import replace
 from appliance.llm.language import values
 from appliance.llm.language.codec import ANY
 from appliance.llm.train.crews import crewed, named
-from appliance.llm.train.examples import ROBOT, Example, Span, pointed, spans, substitute
+from appliance.llm.train.examples import ROBOT, Example, inserted, pointed, spans, substitute
+from appliance.llm.train.framing import done_by, framed, fronted, gapped, told
 from appliance.llm.train.lexicon import Lexicon
 from appliance.llm.train.linking import MAX_WORDS, abreast, joined, robots_of
 from appliance.llm.train.listing import listed
+from appliance.llm.train.renaming import renamed
 from appliance.llm.train.reword import reworded
 
-_NUMERIC = frozenset({"laps", "count", "epochs", "fps"})
 _MARK = re.compile(r"[^\w\s]+")
 _NUMBER_WORDS = (
     *("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"),
@@ -62,11 +63,13 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
         rng: of everything that is random.
     """
     made = listed(example, rng) if rng.random() < 0.2 else example
+    made = gapped(made, lexicon, rng) if rng.random() < 0.1 else made
+    made = _put_otherwise(made, lexicon, rng)
     made = named(made, lexicon, rng) if rng.random() < 0.1 else made
     made = addressed(made, lexicon, rng) if rng.random() < 0.4 else made
     for chance in (0.4, 0.15):
         if others and rng.random() < chance:
-            other = rng.choice(others)
+            other = _put_otherwise(rng.choice(others), lexicon, rng)
             other = addressed(other, lexicon, rng) if rng.random() < 0.6 else other
             if rng.random() < 0.4:
                 other = abreast(other, addressed(rng.choice(others), lexicon, rng), rng) or other
@@ -83,60 +86,10 @@ def vary(example: Example, others: Sequence[Example], lexicon: Lexicon, rng: ran
     return made if len(made.words) <= MAX_WORDS else example
 
 
-# --- names ---------------------------------------------------------------------------------------------------------
-
-
-def renamed(example: Example, lexicon: Lexicon, rng: random.Random, *, share: float = 0.7) -> Example:
-    """Return an example with other names for what it names, each the same wherever it is said."""
-    found = list(spans(example))
-    if any(span.first >= example.own for span in found):
-        return example  # a group was resolved by the roster: the names' kinds matter
-    runs: dict[tuple[str, ...], Span] = {}
-    for span in found:
-        numeric = span.role in _NUMERIC or values.unit_of(span.role)
-        if span.alone and not numeric and span.role not in values.FREE:
-            runs.setdefault(example.words[span.first : span.last + 1], span)
-    swaps: list[tuple[int, int, Sequence[str]]] = []
-    taken: set[int] = set()
-    roster = {word: word for word in example.words[example.own :]}
-    # The longest first: "red box" before "box".
-    for words, span in sorted(runs.items(), key=lambda each: -len(each[0])):
-        if rng.random() > share:
-            continue
-        places = [at for at in range(example.own - len(words) + 1) if example.words[at : at + len(words)] == words]
-        places = [at for at in places if not taken & set(range(at, at + len(words)))]
-        if not all(_movable(found, at, at + len(words) - 1) for at in places):
-            continue
-        other = lexicon.noun(span.role, rng)
-        name = values.robot(" ".join(words))
-        if span.role == ROBOT and name in roster:
-            roster[name] = values.robot(" ".join(other))
-        elif name in roster:
-            continue
-        for at in places:
-            swaps.append((at, at + len(words) - 1, other))
-            taken.update(range(at, at + len(words)))
-    for number in range(example.own, len(example.words)):
-        word = example.words[number]
-        if roster[word] != word:
-            swaps.append((number, number, (roster[word],)))
-    return substitute(example, sorted(swaps, key=lambda each: each[0])) if swaps else example
-
-
-def _movable(found: Sequence[Span], first: int, last: int) -> bool:
-    """Whether every pointer keeps clear of a run, is the run, or covers it."""
-    return all(
-        span.last < first
-        or span.first > last
-        or (
-            span.first <= first
-            and span.last >= last
-            and span.role not in values.FREE
-            and (span.first, span.last) == (first, last)
-        )
-        or (span.first <= first and span.last >= last and span.role in values.FREE)
-        for span in found
-    )
+def _put_otherwise(example: Example, lexicon: Lexicon, rng: random.Random) -> Example:
+    """Return an example with its words in another frame, now and then."""
+    roll = rng.random()
+    return framed(example, lexicon, rng) if roll < 0.15 else fronted(example, rng) if roll < 0.3 else example
 
 
 # --- called by name ------------------------------------------------------------------------------------------------
@@ -151,13 +104,9 @@ def addressed(example: Example, lexicon: Lexicon, rng: random.Random) -> Example
     name = lexicon.noun(ROBOT, rng)
     if rng.random() < 0.25:
         name = (rng.choice(_PHRASES["kinds"]), str(rng.randrange(1, 20)))
-    before, after = rng.choice(_PHRASES["calls"]).split("NAME")
-    opening = [*before.split(), *name, *after.split()]
-    first = len(before.split())
-    made = _inserted(example, 0, opening)
-    pointer = (f"w{first}", f"w{first + len(name) - 1}")
-    symbols = [word for each in made.symbols for word in (pointer if each == "any" else (each,))]
-    return replace(made, symbols=tuple(symbols))
+    if rng.random() < 0.4:
+        return told(example, name, rng)
+    return done_by(example, 0, rng.choice(_PHRASES["calls"]), name)
 
 
 # --- marks, fillers, slips -----------------------------------------------------------------------------------------
@@ -185,24 +134,16 @@ def talkative(example: Example, rng: random.Random) -> Example:
     if roll < 0.45:
         opening = rng.choice(_PHRASES["openings"]).split()
         comma = [","] if rng.random() < 0.4 and opening[-1] not in ("to", "you") else []
-        made = _inserted(made, 0, [*opening, *comma])
+        made = inserted(made, 0, [*opening, *comma])
     if roll > 0.35 and roll < 0.75:
         comma = [","] if rng.random() < 0.3 else []
-        made = _inserted(made, made.own, [*comma, *rng.choice(_PHRASES["endings"]).split()])
+        made = inserted(made, made.own, [*comma, *rng.choice(_PHRASES["endings"]).split()])
     if roll > 0.7:
         inside = {number for span in spans(made) for number in range(span.first + 1, span.last + 1)}
         free = [number for number in range(1, made.own) if number not in inside]
         if free and len(words) > 3:
-            made = _inserted(made, rng.choice(free), rng.choice(_PHRASES["between"]).split())
+            made = inserted(made, rng.choice(free), rng.choice(_PHRASES["between"]).split())
     return made
-
-
-def _inserted(example: Example, at: int, words: Sequence[str]) -> Example:
-    symbols = tuple(
-        f"w{int(each[1:]) + (len(words) if int(each[1:]) >= at else 0)}" if re.fullmatch(r"w\d+", each) else each
-        for each in example.symbols
-    )
-    return Example((*example.words[:at], *words, *example.words[at:]), example.own + len(words), symbols)
 
 
 def misspelt(example: Example, rng: random.Random) -> Example:

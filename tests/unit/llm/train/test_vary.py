@@ -11,9 +11,10 @@ from appliance.llm.language.codec import read
 from appliance.llm.language.words import words_of
 from appliance.llm.train.examples import Example, example_of, is_exact, substitute
 from appliance.llm.train.lexicon import Lexicon, syllables
+from appliance.llm.train.renaming import renamed
 from appliance.llm.train.splits import names, shape, split
 from appliance.llm.train.tokens import Tokens
-from appliance.llm.train.vary import addressed, numbered, renamed, rostered, unmarked, vary
+from appliance.llm.train.vary import addressed, numbered, rostered, unmarked, vary
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
 
