@@ -43,31 +43,8 @@ _BEGINNINGS = frozenset({".", ";", "!", ":"})
 """Behind these a sentence begins; behind the others an order does."""
 _BEFORE = _BEGINNINGS | {"then", "and", "please"}
 _BEHIND = frozenset(
-    [
-        ".",
-        ";",
-        "!",
-        "(",
-        "then",
-        "from",
-        "at",
-        "in",
-        "on",
-        "with",
-        "to",
-        "for",
-        "into",
-        "onto",
-        "inside",
-        "near",
-        "by",
-        "twice",
-        "before",
-        "after",
-        "once",
-        "when",
-        "please",
-    ]
+    {".", ";", "!", "(", "then", "from", "at", "in", "on", "with", "to", "for", "into", "onto", "inside", "near"}
+    | {"by", "twice", "before", "after", "once", "when", "please"}
 )
 _PLACED = frozenset({"at", "in", "on", "from", "to", "into", "inside", "near", "behind", "under", "with", "for"})
 _WHERE = frozenset({"place", "at", "area", "to", "into", "person"})
