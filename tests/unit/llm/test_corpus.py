@@ -18,7 +18,7 @@ from appliance.llm.corpus.tally import tally
 from appliance.model import Subtask
 from appliance.skills.catalogue import DOMAINS, Catalogue
 
-pytestmark = pytest.mark.thorough
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(900)]  # seconds on a free processor, minutes on a busy one
 
 LEAST_OF_A_SKILL = 15
 LEAST_OF_A_DOMAIN = 75
