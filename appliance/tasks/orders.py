@@ -99,10 +99,13 @@ class Orders:
 
     def add(self, gateway: str, request: RunRequest) -> None:
         """Have an order ready for when the record is written."""
+        # Until then, too, the new attempt is not one that was ordered as long ago as the one before.
+        self._sent_at[request.subtask] = time.monotonic()
         self._outgoing.append((gateway, request))
 
     def move(self, news: MoveReady, request: RunRequest, *, left: SubtaskRecord) -> None:
         """Have a run ended and its next attempt ordered elsewhere when the record is written."""
+        self._sent_at[request.subtask] = time.monotonic() + LEAVE_S
         self._moves.append((news, replace(request, moves=request.moves + 1), left))
 
     def go(self) -> None:
