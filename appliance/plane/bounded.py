@@ -35,6 +35,10 @@ _STRANGERS_S = 60.0
 """How often one of a ring meets somebody whom it does not know, at least; of a large ring one each second. Two rings
 that know nothing of each other, after a long cut or a start of many at one moment, become one by that."""
 
+_TOKEN_S = 2.0
+"""How long the token of a member that was heard of may take to come. One without is met at once: it may have gone while
+whoever told of it did not know that yet, and then no news of it will ever come."""
+
 
 class Heard(Struct, frozen=True):
     """Answer to who leaves."""
@@ -59,6 +63,8 @@ class BoundedMembership(Membership):
         """For whom -> gateways that stay members while their token is seen, whether the view keeps them or not."""
         self._shown: set[str] = set()
         """Of those watched, whose token is seen."""
+        self._expected: dict[str, asyncio.TimerHandle] = {}
+        """Member whose token is not seen yet -> when it should have come."""
         self._sooner = asyncio.Event()
         self._running: list[asyncio.Task[None]] = []
         rpc.register("ring_next", NextAsk, self._on_next, exchange=False)
@@ -156,6 +162,9 @@ class BoundedMembership(Membership):
         for closer in self._watched.values():
             closer.close()
         self._watched.clear()
+        for each in self._expected.values():
+            each.cancel()
+        self._expected.clear()
 
     # --- upkeep -----------------------------------------------------------------------------------------------
 
@@ -255,10 +264,22 @@ class BoundedMembership(Membership):
         if known == before:
             return
         self._members = known | {self._me}
+        for name in before - known:
+            if (expected := self._expected.pop(name, None)) is not None:
+                expected.cancel()
+        for name in known - before - self._shown:
+            self._expected[name] = asyncio.get_running_loop().call_later(_TOKEN_S, self._miss, name)
         for name in sorted(known - before):
             self._tell(self.on_joined, name)
         for name in sorted(before - known):
             self._tell(self.on_lost, name)
+
+    def _miss(self, name: str) -> None:
+        """See whether a member is there whose token should have come."""
+        del self._expected[name]
+        if name not in self._shown:
+            self._upkeep.doubt(name, self._now())
+            self._sooner.set()
 
     def _on_token(self, key: str, alive: bool) -> None:
         name = key.split("/")[-2]

@@ -12,7 +12,8 @@ from appliance.model import GatewayStatus
 from appliance.plane import bounded
 from appliance.plane.node import Plane
 from appliance.plane.overlay.lookup import NextAsk
-from appliance.plane.overlay.view import Step
+from appliance.plane.overlay.upkeep import MeetAsk, Pace
+from appliance.plane.overlay.view import Around, Step
 from appliance.plane.ring import Ring
 from appliance.plane.router import run_router
 from appliance.plane.settings import PlaneConfig
@@ -118,6 +119,32 @@ async def test_records_are_found_through_bounded_views(tmp_path: Path, free_port
             read = await planes[left[number % len(left)]].dht.read(key)
             assert read is not None
             assert read.version == version
+
+
+async def test_a_member_that_is_only_heard_of_is_looked_for(
+    tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that was killed while others told of it shows no token: it is met, and forgotten, long before its turn."""
+    monkeypatch.setattr(bounded, "_TOKEN_S", 0.2)
+    ends = [f"tcp/127.0.0.1:{port}" for port in free_ports(2)]
+    async with contextlib.AsyncExitStack() as stack:
+        planes: list[Plane] = []
+        for number, end in enumerate(ends):
+            config = PlaneConfig(listen=(end,), connect=tuple(ends[:number]), view=VIEW)
+            planes.append(await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=tmp_path / f"{number}"))
+            stack.push_async_callback(planes[-1].close)
+        await _until(lambda: all(len(plane.members()) == 2 for plane in planes))
+        came, lost = list[str](), list[str]()
+        planes[1].on_member_joined.append(came.append)
+        planes[1].on_member_lost.append(lost.append)
+        membership = planes[1]._membership
+        assert isinstance(membership, bounded.BoundedMembership)
+        membership._upkeep._pace = Pace(least_s=0.01, most_s=3600.0)
+        membership._upkeep.interval_s = 3600.0
+        await planes[0].rpc.call("g1", "ring_meet", MeetAsk("killed"), Around)
+        await _until(lambda: "killed" in lost)
+        assert came == ["killed"]
+        assert planes[1].members() == {"g0", "g1"}
 
 
 async def test_those_that_began_apart_become_one_ring(

@@ -90,7 +90,8 @@ class Upkeep:
         self._finger = view.origin % view.bound
         """Number of the finger looked up last; not all members begin with the same one."""
         self._first: list[str] = []
-        """To be met before all others, the last first: a joiner's neighbours; members that their neighbour left out."""
+        """To be met before all others, the last first: a joiner's neighbours; members that their neighbour left out, or
+        that show no token."""
 
     def settle(self, now: float) -> None:
         """Begin as if nothing had changed for long: rounds spread over the longest interval."""
@@ -164,6 +165,12 @@ class Upkeep:
         self._late[member] = count
         # Not the one to be met next again.
         self._seen[member] = now
+
+    def doubt(self, member: str, now: float) -> None:
+        """A member that was heard of shows no token: it is met next, since it may be gone."""
+        if member in self.view and member not in self._first:
+            self._first = [*self._first, member][-_MOST_FIRST:]
+            self.next_at = min(self.next_at, now + self._pace.least_s)
 
     def unreachable(self, member: str, now: float, *, in_round: bool = True) -> None:
         """A member is not there: found so in a round, by a lookup, or told by whoever watches for it."""

@@ -233,6 +233,22 @@ def test_who_is_late_once_is_not_gone() -> None:
     assert "nobody" not in upkeep.view
 
 
+def test_who_is_doubted_is_met_next() -> None:
+    """A member that shows no token is met in the next round, which comes at once; one that is not known is not."""
+    fleet = Fleet(bound=16, seed=5).settled(f"gw-{n}" for n in range(12))
+    upkeep = fleet.members[fleet.any()]
+    upkeep.settle(fleet.now)
+    upkeep.next_at = fleet.now + 10.0
+    member = upkeep.view.names[4]
+    upkeep.doubt("nobody", fleet.now)
+    assert upkeep.next_at == fleet.now + 10.0
+    upkeep.doubt(member, fleet.now)
+    upkeep.doubt(member, fleet.now)
+    assert upkeep.next_at <= fleet.now + 0.2
+    assert upkeep.due(fleet.now) == Meet(member)
+    assert upkeep.due(fleet.now) != Meet(member)
+
+
 def test_rounds_that_take_long_come_seldom() -> None:
     """Where a round takes half a second the next comes after two at the soonest, and never later than it may."""
     fleet = Fleet(bound=16, seed=4).settled(f"gw-{n}" for n in range(12))
