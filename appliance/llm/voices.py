@@ -119,15 +119,21 @@ class Voice:
 
 
 class Voices:
-    """Several models as one; each goes through the same answer."""
+    """Several models as one; each goes through the same answer.
+
+    They read what is said when they are next asked, all of it at once: of what the guide leaves no choice they are not
+    asked, and a model reads three tokens together in little more time than one.
+    """
 
     def __init__(self, voices: Sequence[Voice]) -> None:
         self._voices = tuple(voices)
         self._said: list[int] = []
+        self._read: list[int] = []
+        """What of it the models have read, and what was taken back since."""
 
     def begin(self, words: Sequence[str], own: int) -> int:
         """Read an instruction; return the tokens that are left for the answer. As `Voice.begin`."""
-        self._said = []
+        self._said, self._read = [], []
         return min(voice.begin(words, own) for voice in self._voices)
 
     @property
@@ -137,6 +143,7 @@ class Voices:
 
     def likely(self, tokens: Sequence[int]) -> list[float]:
         """Return how likely tokens are to come next, as logarithms up to a number that is the same for all."""
+        self._catch_up()
         each = [voice.likely(tokens) for voice in self._voices]
         return [sum(values) / len(values) for values in zip(*each, strict=True)]
 
@@ -147,16 +154,20 @@ class Voices:
     def go_on(self, token: int) -> None:
         """Take a token as said."""
         self._said.append(token)
-        for voice in self._voices:
-            voice.go_on([token])
 
     def say(self, tokens: Sequence[int]) -> None:
-        """Have said these tokens and no others, from the beginning of the answer."""
+        """Have said these tokens and no others, from the beginning of the answer; one more is said before `likely`."""
+        self._said = list(tokens)
+
+    def _catch_up(self) -> None:
+        """Have the models read what is said and not read, and forget what was taken back."""
+        said, read = self._said, self._read
         same = 0
-        while same < min(len(self._said), len(tokens)) and self._said[same] == tokens[same]:
+        while same < min(len(said), len(read)) and said[same] == read[same]:
             same += 1
         for voice in self._voices:
-            voice.set_back(same)
-            if tokens[same:]:
-                voice.go_on(tokens[same:])
-        self._said = list(tokens)
+            if same < len(read):
+                voice.set_back(same)
+            if same < len(said):
+                voice.go_on(said[same:])
+        self._read = list(said)

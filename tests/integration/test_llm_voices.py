@@ -107,6 +107,16 @@ def test_together_they_say_the_mean_of_what_each_says(make: Make) -> None:
         voice.set_back(1)
         voice.go_on([14, 15])
     agree()
+    # What is said without being asked in between is read all at once, and what was taken back is not.
+    for token in (16, 17, 18):
+        together.go_on(token)
+    together.say([11, 14])
+    for token in (19, 20):
+        together.go_on(token)
+    for voice in alone:
+        voice.set_back(2)
+        voice.go_on([19, 20])
+    agree()
 
 
 def test_a_planner_answers_with_all_its_models(make: Make) -> None:
