@@ -17,6 +17,10 @@ from appliance.llm.language.words import words_of
 from appliance.skills.catalogue import Catalogue
 
 _POINTER = re.compile(r"w(\d+)")
+DETERMINERS = frozenset(
+    {"the", "a", "an", "this", "that", "these", "those", "my", "your", "our", "his", "her", "its", "their", "some"}
+)
+"""What may stand before a name without being of it."""
 ROBOT = "robot"
 """Role of the words that name a robot."""
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from appliance.llm.train.examples import ROBOT, Example, Span, inserted, pointed, spans, substitute
+from appliance.llm.train.examples import DETERMINERS, ROBOT, Example, Span, inserted, pointed, spans, substitute
 from appliance.llm.train.lexicon import Lexicon
 from appliance.llm.train.linking import MAX_SUBTASKS, is_a_clause, robots_of, subtasks_of, then_linked, unended
 from appliance.llm.train.renaming import renamed
@@ -36,9 +36,6 @@ _IRREGULAR = {
 _VERBS = {tuple(each.split()) for each in _FRAMES["verbs"]}
 _STARTS = frozenset({each[0] for each in _VERBS} | set(_FRAMES["starts"]))
 _WORKED_ON = frozenset({"object", "asset", "target", "area", "person", "model", "dataset", "quantity"})
-_ARTICLES = frozenset(
-    {"the", "a", "an", "this", "that", "these", "those", "my", "your", "our", "his", "her", "their", "some"}
-)
 _BEGINNINGS = frozenset({".", ";", "!", ":"})
 """Behind these a sentence begins; behind the others an order does."""
 _BEFORE = _BEGINNINGS | {"then", "and", "please"}
@@ -79,7 +76,7 @@ def _verb_before(example: Example, span: Span) -> int | None:
     if span.role not in _WORKED_ON or not span.alone or span.last >= example.own or _goes_on(example, span.last + 1):
         return None
     end = span.first
-    while end and words[end - 1] in _ARTICLES:
+    while end and words[end - 1] in DETERMINERS:
         end -= 1
     first = next((end - long for long in (2, 1) if end >= long and words[end - long : end] in _VERBS), None)
     if first is None or not (first == 0 or words[first - 1] in _BEFORE or _comma_before(example, first)):
@@ -104,7 +101,7 @@ def _comma_before(example: Example, at: int) -> bool:
 def _passive(example: Example, first: int, span: Span, lexicon: Lexicon, rng: random.Random) -> Example:
     words = example.words
     end = span.first
-    while words[end - 1] in _ARTICLES and end - 1 >= first:
+    while words[end - 1] in DETERMINERS and end - 1 >= first:
         end -= 1
     verb, *particle = words[first:end]
     stands_for = {"DONE": [past(verb), *particle], "DOING": [going_on(verb), *particle]}
@@ -180,7 +177,7 @@ def fronted(example: Example, rng: random.Random) -> Example:
     if last is None or last.role not in _WHERE or not last.alone:
         return example
     first = last.first
-    while first and example.words[first - 1] in _ARTICLES:
+    while first and example.words[first - 1] in DETERMINERS:
         first -= 1
     first -= 1
     if first < 2 or example.words[first] not in _PLACED or example.words[first - 1].isdigit():
@@ -241,7 +238,7 @@ def _bare(example: Example) -> Example | None:
 def _first_said(example: Example) -> int:
     """Return where the first name begins, with its article."""
     first = min(span.first for span in spans(example))
-    while first and example.words[first - 1] in _ARTICLES:
+    while first and example.words[first - 1] in DETERMINERS:
         first -= 1
     return first
 

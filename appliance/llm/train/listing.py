@@ -11,7 +11,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from appliance.llm.language.plurals import singular
-from appliance.llm.train.examples import Example, spans
+from appliance.llm.train.examples import DETERMINERS, Example, spans
 from appliance.llm.train.linking import subtasks_of
 
 _PHRASES: dict[str, list[str]] = tomllib.loads(Path(__file__).with_name("phrases.toml").read_text(encoding="utf-8"))
@@ -20,9 +20,7 @@ _QUALITIES = tuple(
 )
 _ROLES = frozenset({"object", "asset", "place", "area"})
 _TARGETS = frozenset({"photograph", "inspect", "scan_thermal", "record_video", "measure", "read"})
-_ARTICLES = frozenset(
-    {"the", "a", "an", "that", "this", "my", "your", "his", "her", "its", "our", "their", "any", "every", "each"}
-)
+_OF_ONE = DETERMINERS - {"these", "those", "some"} | {"any", "every", "each"}
 _WITHIN = frozenset({"of", "on", "in", "at", "by", "to", "with", "from", "and", "under", "behind", "near", "for", "'s"})
 """A name with one of these has no noun at its end that could be several."""
 _ALONE = frozenset({"guide", "follow", "handover", "give"})
@@ -59,7 +57,7 @@ def listed(example: Example, rng: random.Random) -> Example:
         return example
     if _WITHIN & set(words) or example.words.count(noun) > 1 or {"it", "its"} & set(example.words):
         return example
-    first = span.first - (span.first > 0 and example.words[span.first - 1] in _ARTICLES)
+    first = span.first - (span.first > 0 and example.words[span.first - 1] in _OF_ONE)
     kinds = [*words[:-1], plural]
     made = _by_marks(kinds, rng) if rng.random() < 0.6 else _by_looks(words, kinds, rng)
     grown = len(made.words) - (span.last + 1 - first)

@@ -10,15 +10,12 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from appliance.llm.train.examples import Example, pointed, spans, substitute
+from appliance.llm.train.examples import DETERMINERS, Example, pointed, spans, substitute
 
 Phrase = tuple[str, ...]
 Others = dict[Phrase, tuple[Phrase, ...]]
 """What may stand for a phrase, by the phrase."""
 
-_ARTICLES = frozenset(
-    {"the", "a", "an", "this", "that", "these", "those", "my", "your", "our", "his", "her", "its", "their", "some"}
-)
 _DOUBLED = {
     **{
         each: f"{each}{each[-1]}ing"
@@ -121,12 +118,12 @@ def _found(example: Example, kept: set[int]) -> Iterator[tuple[int, int, Sequenc
         if not others or span.first >= example.own:
             continue
         end = span.first
-        while end and words[end - 1] in _ARTICLES and end - 1 not in kept:
+        while end and words[end - 1] in DETERMINERS and end - 1 not in kept:
             end -= 1
         for length in range(min(_LONGEST, end), 0, -1):
             if (phrase := words[end - length : end]) in others:
                 # After an article it is a noun: "the lift to floor 2".
-                if end == length or words[end - length - 1] not in _ARTICLES:
+                if end == length or words[end - length - 1] not in DETERMINERS:
                     yield end - length, end - 1, others[phrase]
                 break
     skills = ("", *dict.fromkeys(symbols[start] for start in starts))
