@@ -23,6 +23,12 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
+def run_of(key: str) -> tuple[str, str]:
+    """Return task and subtask of a run event's key; empty where it is none."""
+    parts = key.rsplit("/", 3)
+    return (parts[1], parts[3]) if len(parts) == 4 and parts[2] == "run" else ("", "")
+
+
 class Keys:
     """Key names of one fleet. Methods that take no name return the expression that matches all."""
 

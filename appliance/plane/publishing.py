@@ -34,8 +34,12 @@ class Publishing:
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
 
-    def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:
-        """Publish; returns at once. What cannot be sent (too large, queue full) is counted and logged."""
+    def put(self, key: str, payload: bytes, *, encoding: str = "application/json", express: bool = False) -> None:
+        """Publish; returns at once. What cannot be sent (too large, queue full) is counted and logged.
+
+        `express`: at once, and what waits before it with it. Others may wait for a millisecond on each link for more
+        to go in one packet, where something was sent just before.
+        """
         if len(payload) > self._wire.config.max_payload_bytes:
             self._wire.refuse("oversize put", key=key, size=len(payload))
             return
@@ -45,6 +49,7 @@ class Publishing:
             payload,
             encoding=encoding,
             congestion_control=zenoh.CongestionControl.BLOCK,
+            express=express,
         )
         self._wire.send(key, send, len(payload))
 
@@ -52,12 +57,20 @@ class Publishing:
         """Publish that a key's fact is gone."""
         self._wire.send(key, partial(self._wire.raw.delete, key, congestion_control=zenoh.CongestionControl.BLOCK), 0)
 
-    def subscribe(self, expr: str, callback: Callable[[Message], None]) -> Closer:
-        """Have every put and delete under `expr` delivered, as bytes; oversize ones are counted and dropped."""
+    def subscribe(
+        self, expr: str, callback: Callable[[Message], None], *, heed: Callable[[str], bool] = lambda _: True
+    ) -> Closer:
+        """Have every put and delete under `expr` delivered, as bytes; oversize ones are counted and dropped.
+
+        `heed` is asked first, on a thread of Zenoh's, whether a key is anybody's business here: what is not does not
+        wake the event loop. It must neither block nor go through what the event loop changes meanwhile.
+        """
         name, limit = self._wire.name(expr), self._wire.config.max_payload_bytes
 
         def take(sample: zenoh.Sample) -> None:
             key, size = str(sample.key_expr), len(sample.payload)
+            if not heed(key):
+                return
             if size > limit:
                 self._wire.inbox.post(partial(self._wire.refuse, f"oversize {name}", key=key, size=size))
                 return
@@ -101,10 +114,11 @@ class Publishing:
         callback: Callable[[str, T | None], None],
         *,
         wanted: Callable[[str], bool] = lambda _: True,
+        heed: Callable[[str], bool] = lambda _: True,
     ) -> Closer:
         """Have facts delivered decoded, None when one is deleted; malformed ones are counted, logged, dropped.
 
-        Those whose key is not `wanted` are not even decoded.
+        Those whose key is not `wanted` are not even decoded; `heed` as of `subscribe`.
         """
         decoder, name = msgspec.json.Decoder(kind), self._wire.name(expr)
 
@@ -121,4 +135,4 @@ class Publishing:
                 return
             callback(message.key, value)
 
-        return self.subscribe(expr, take)
+        return self.subscribe(expr, take, heed=heed)

@@ -59,7 +59,7 @@ class Choosing:
                 return explained(decision, avoid)
             self._check(request)
             gateway = decision.gateway
-            sent = remote.promise(gateway)
+            sent = remote.promise(gateway, (request.task, request.subtask))
             try:
                 accepted = await self._plane.rpc.call(
                     gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
@@ -73,7 +73,7 @@ class Choosing:
                 avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}
                 self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
             else:
-                remote.turned_out(sent, good=True)
+                remote.turned_out(sent, good=True, container=accepted.container)
                 return passed_on(accepted, explained(decision, avoid))
         raise PoolError("a selection without other gateways chose one")
 

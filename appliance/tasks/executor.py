@@ -24,7 +24,7 @@ from appliance.model import (
     RunEventKind,
     RunRequest,
 )
-from appliance.plane.keys import check_name
+from appliance.plane.keys import check_name, run_of
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
 from appliance.pool.api import Hinted
@@ -61,7 +61,8 @@ class Executor:
     def __init__(self, plane: Plane, pool: Pool, remote: RemoteContainers, config: TasksConfig) -> None:
         self._plane = plane
         self._config = config
-        self._records: Closer | None = None
+        self._remote = remote
+        self._closers: list[Closer] = []
         self._pool = pool
         self._running: dict[str, asyncio.Task[None]] = {}
         self._here: dict[str, Here] = {}
@@ -97,7 +98,12 @@ class Executor:
 
     async def start(self) -> None:
         """Load what was kept; a run that was in progress when the gateway went down has failed."""
-        self._records = self._plane.session.subscribe(self._plane.keys.task(), self._on_record)
+        session, keys = self._plane.session, self._plane.keys
+        self._closers.append(session.subscribe(keys.task(), self._on_record))
+        sent = session.subscribe_typed(
+            keys.run(), RunEvent, self._on_event, heed=lambda key: self._remote.waits_for(run_of(key))
+        )
+        self._closers.append(sent)
         self._passing.moved.update(await self._kept.load())
         self._passing.start()
 
@@ -263,6 +269,11 @@ class Executor:
             if run_id != request.run_id:
                 await self._end(run_id)
 
+    def _on_event(self, _: str, event: RunEvent | None) -> None:
+        """Hear of the ends of runs that went to other gateways."""
+        if event is not None and event.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+            self._remote.over((event.task, event.subtask), event.gateway)
+
     def _on_record(self, message: Message) -> None:
         """End runs whose attempt the record has left behind; forget the runs of a task that has ended."""
         task = message.key.split("/")[-2]
@@ -412,8 +423,8 @@ class Executor:
         finally:
             # Until here records are heard: a task that ends or moves on elsewhere ends its runs here.
             self._passing.stop()
-            if self._records is not None:
-                self._records.close()
+            for each in self._closers:
+                each.close()
             if self._background:
                 await asyncio.wait(list(self._background), timeout=2.0)
 

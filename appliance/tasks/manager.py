@@ -32,6 +32,7 @@ from appliance.model import (
     TaskRequest,
     encode,
 )
+from appliance.plane.keys import run_of
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
@@ -157,7 +158,9 @@ class TaskManager:
             published=self.recovery.published,
             audit=self._audit,
         ).register()
-        news = self.plane.session.subscribe_typed(self.plane.keys.run(), RunEvent, self._on_run_event)
+        news = self.plane.session.subscribe_typed(
+            self.plane.keys.run(), RunEvent, self._on_run_event, heed=lambda key: run_of(key)[0] in self._drivers
+        )
         self._closers.append(news.close)
         self._closers.append(self.plane.session.subscribe(self.plane.keys.task(), self._ages.hear).close)
         self.plane.on_member_lost.append(self._on_member_lost)

@@ -92,6 +92,8 @@ class Sent(Struct):
     """Container -> how many runs it had had, of those that were ready there when it was sent."""
     container: str = ""
     """The one that it got; empty while that is not known."""
+    run: tuple[str, str] = ("", "")
+    """Its task and subtask."""
 
 
 class RemoteContainers:
@@ -111,6 +113,8 @@ class RemoteContainers:
         self._trust: dict[str, _Trust] = {}
         self._sent: dict[str, list[Sent]] = {}
         """Gateway -> the runs that were sent to it of late."""
+        self._runs: dict[tuple[str, str], Sent] = {}
+        """The same, by task and subtask."""
         self._doubted: dict[str, float] = {}
         """Gateway -> until when what is known of its containers is not believed: it had none when it was asked."""
         self.searches: Counter[str] = Counter()
@@ -213,16 +217,39 @@ class RemoteContainers:
         """Whether a run was sent to it so lately that it has not told of it yet."""
         return bool(self._open(gateway))
 
-    def promise(self, gateway: str) -> Sent:
+    def promise(self, gateway: str, run: tuple[str, str] = ("", "")) -> Sent:
         """Note that a run is being sent to a gateway: one of its ready containers is spoken for.
 
         What is returned tells `turned_out` which of the runs that were sent there its answer is about.
         """
         known = self._plane.registry.containers.get(gateway, {})
         runs = {each.id: each.runs for each in known.values() if each.state is ContainerState.READY}
-        sent = Sent(gateway=gateway, until=time.monotonic() + PROMISED_S, runs=runs)
-        self._sent[gateway] = [*self._open(gateway)[-MOST_PROMISED:], sent]
+        sent = Sent(gateway=gateway, until=time.monotonic() + PROMISED_S, runs=runs, run=run)
+        before = self._sent.get(gateway, ())
+        kept = self._sent[gateway] = [*self._open(gateway)[-MOST_PROMISED:], sent]
+        for each in before:
+            if each not in kept:
+                self._runs.pop(each.run, None)
+        self._runs[run] = sent
         return sent
+
+    def waits_for(self, run: tuple[str, str]) -> bool:
+        """Whether a run was sent elsewhere so lately that its end is worth hearing of; asked on any thread."""
+        return run in self._runs
+
+    def over(self, run: tuple[str, str], gateway: str) -> None:
+        """Note that a run has ended where it was sent to: its container is ready again, which will be told later.
+
+        Not where others wait for it: it is theirs.
+        """
+        sent, status = self._runs.get(run), self._plane.registry.gateways.get(gateway)
+        if sent is not None and sent.gateway == gateway and (status is None or not status.queue):
+            self._drop(sent)
+
+    def _drop(self, sent: Sent) -> None:
+        self._runs.pop(sent.run, None)
+        if sent.gateway in self._sent:
+            self._sent[sent.gateway] = [each for each in self._sent[sent.gateway] if each is not sent]
 
     async def _ask_all(
         self, gateways: Sequence[str], need: Need, avoid: Collection[str]
@@ -333,8 +360,7 @@ class RemoteContainers:
             self._trust.pop(gateway, None)
             return
         # An answer that took long may be about a run that is not counted any more; those sent since are not meant.
-        if gateway in self._sent:
-            self._sent[gateway] = [each for each in self._sent[gateway] if each is not sent]
+        self._drop(sent)
         self._doubted[gateway] = time.monotonic() + PROMISED_S
         trust = self._trust.setdefault(gateway, _Trust())
         trust.empty += 1
@@ -343,7 +369,8 @@ class RemoteContainers:
             trust.until = now() + min(LEFT_OUT_S, FIRST_LEFT_OUT_S * 2**doublings)
 
     def _forget(self, gateway: str) -> None:
-        self._sent.pop(gateway, None)
+        for each in self._sent.pop(gateway, ()):
+            self._runs.pop(each.run, None)
         self._doubted.pop(gateway, None)
         self._round_trip_ms.pop(gateway, None)
         self._trust.pop(gateway, None)

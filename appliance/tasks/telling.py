@@ -33,7 +33,7 @@ class Telling:
         while len(self._numbers) > MOST_RUNS:
             self._heard.pop(self._numbers.popitem(last=False)[0], None)
         event = replace(event, number=number, at_ns=time.time_ns())
-        self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event))
+        self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event), express=True)
         self.on_told(event)
 
     def silent_s(self, task: str, subtask: str, attempt: int) -> float | None:

@@ -117,6 +117,27 @@ async def test_facts_that_nobody_wants_are_not_decoded(pair: tuple[Session, Sess
     assert other.refused == {}
 
 
+async def test_what_is_not_heeded_does_not_reach_the_loop(pair: tuple[Session, Session]) -> None:
+    """Keys that are nobody's business here are left on Zenoh's thread, however large or wrong what they say is."""
+    one, other = pair
+    seen: list[str] = []
+    other.subscribe_typed(
+        other.keys.log(), LogLine, lambda key, _: seen.append(key), heed=lambda key: key.endswith("/b/log")
+    )
+    await _heard(one, other)
+    posted = list[object]()
+    post = other._wire.inbox.post
+    other._wire.inbox.post = lambda *args, **more: posted.append(args) or post(*args, **more)  # type: ignore[method-assign]
+    good = encode(LogLine(at_ns=1, level="info", source="s", event="e"))
+    for gateway, payload in (("a", good), ("a", b"{"), ("b", good), ("a", good), ("b", good)):
+        one.put(one.keys.log(gateway), payload, express=True)
+    one._wire.raw.put(one.keys.log("a"), b"x" * (LIMIT + 1))
+    one.put(one.keys.log("b"), good)
+    await _until(lambda: len(seen) == 3)
+    assert len(posted) == 3
+    assert other.refused == {}
+
+
 async def test_a_flood_is_bounded_and_counted(free_port: int) -> None:
     """What comes in faster than the loop takes it is dropped beyond the bound and counted; afterwards all is well."""
     endpoint = f"tcp/127.0.0.1:{free_port}"

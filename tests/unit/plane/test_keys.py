@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import PayloadError
-from appliance.plane.keys import Keys, check_name
+from appliance.plane.keys import Keys, check_name, run_of
 
 
 @given(st.text(max_size=80))
@@ -46,3 +46,11 @@ def test_every_key_is_within_the_fleet() -> None:
     ]  # fmt: skip
     assert len(set(made)) == len(made)
     assert all(everything.includes(zenoh.KeyExpr(key)) for key in made)
+
+
+def test_a_run_events_key_names_task_and_subtask() -> None:
+    """Of other keys, and of what is no key, it names nothing."""
+    keys = Keys("f")
+    assert run_of(keys.run("t-1", "s2")) == ("t-1", "s2")
+    for other in (keys.task("t-1"), keys.log("g"), "run", "/run/", "", "a/run/b"):
+        assert run_of(other) == ("", "")

@@ -34,7 +34,7 @@ class FakeSession:
         self.queries: list[bytes] = []
         self.replies: list[bytes | SwiftbotError] = []
 
-    def put(self, key: str, payload: bytes) -> None:
+    def put(self, key: str, payload: bytes, *, express: bool = False) -> None:
         """Keep and deliver."""
         self.puts.append((key, payload))
         for expr, callback in list(self.subscribers):
@@ -46,11 +46,21 @@ class FakeSession:
         self.subscribers.append((expr, callback))
         return FakeCloser()
 
-    def subscribe_typed(self, expr: str, kind: type[Any], callback: Callable[[str, Any], None]) -> FakeCloser:
+    def subscribe_typed(
+        self,
+        expr: str,
+        kind: type[Any],
+        callback: Callable[[str, Any], None],
+        *,
+        heed: Callable[[str], bool] = lambda _: True,
+    ) -> FakeCloser:
         """Deliver decoded messages."""
-        return self.subscribe(
-            expr, lambda message: callback(message.key, msgspec.json.decode(message.payload, type=kind))
-        )
+
+        def take(message: Message) -> None:
+            if heed(message.key):
+                callback(message.key, msgspec.json.decode(message.payload, type=kind))
+
+        return self.subscribe(expr, take)
 
     def refuse(self, what: str, **_: object) -> None:
         """Count."""

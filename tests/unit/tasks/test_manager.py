@@ -228,11 +228,14 @@ async def test_a_flood_of_tasks_does_not_get_past_the_bound_while_records_are_wr
 
 
 async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, plane: Any) -> None:
-    """Events of gateways that are not there, or under another task's key, reach no driver."""
+    """Events of gateways that are not there, or under another key, reach no driver; other tasks' are not looked at."""
     await manager.submit(wish(plane))
     event = RunEvent(task="t-1", subtask="s1", attempt=0, kind=RunEventKind.SUCCEEDED, gateway="evil")
     plane.session.put(plane.keys.run("t-1", "s1"), encode(event))
+    plane.session.put(plane.keys.run("t-1", "s2"), encode(replace(event, gateway="gw-1")))
+    assert plane.session.refused == {"forged run event": 2}
     plane.session.put(plane.keys.run("t-2", "s1"), encode(replace(event, gateway="gw-1")))
+    plane.session.put(plane.keys.run("t-2", "s1"), b"{")
     assert plane.session.refused == {"forged run event": 2}
 
 

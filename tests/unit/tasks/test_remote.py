@@ -201,6 +201,38 @@ async def test_a_run_holds_its_container_until_that_one_is_told_of(remote: Remot
     assert {each.id for each in remote.ready(NEED)} == {"a"}
 
 
+async def test_a_run_that_was_heard_to_end_holds_nothing(remote: RemoteContainers, plane: Any) -> None:
+    """Its container is ready again long before it is told of, unless others wait there; only whoever has it ends it."""
+    know(plane, container("gw-2", "a"))
+    plane.registry.ages = {"gw-2": 0.1}
+    run = ("t1", "s1")
+    remote.turned_out(remote.promise("gw-2", run), good=True, container="a")
+    assert remote.waits_for(run)
+    remote.over(run, "gw-3")
+    remote.over(("t1", "s2"), "gw-2")
+    assert remote.ready(NEED) == []
+    remote.over(run, "gw-2")
+    assert not remote.waits_for(run)
+    assert {each.id for each in remote.ready(NEED)} == {"a"}
+    remote.promise("gw-2", run)
+    plane.registry.gateways["gw-2"] = GatewayStatus(id="gw-2", fleet="f", queue=1)
+    remote.over(run, "gw-2")
+    assert remote.ready(NEED) == []
+
+
+async def test_runs_that_were_sent_are_not_remembered_for_ever(
+    remote: RemoteContainers, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those whose time is over go when the next one is sent, those of a lost gateway with it."""
+    know(plane, container("gw-2", "a"))
+    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", -1.0)
+    for number in range(5):
+        remote.promise("gw-2", ("t1", f"s{number}"))
+    assert [remote.waits_for(("t1", f"s{number}")) for number in range(5)] == [False] * 4 + [True]
+    remote._forget("gw-2")
+    assert not remote.waits_for(("t1", "s4"))
+
+
 async def test_an_offer_that_came_to_nothing_holds_no_container(remote: RemoteContainers, plane: Any) -> None:
     """A run that was refused has none: when its gateway is believed again, all that are ready there count."""
     know(plane, container("gw-2", "a"))
