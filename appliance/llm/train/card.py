@@ -67,8 +67,8 @@ def model_card(
             "  the same pairs; it has a say in which of several answers is given.",
             *(
                 [
-                    f"- **Asked together**: this model and the one in `{', '.join(made['beside'])}`, which was trained",
-                    "  like it; an answer is as likely as both together find it.",
+                    f"- **Asked together**: this model and those in {', '.join(made['beside'])}, trained like it;",
+                    "  an answer is as likely as all together find it.",
                 ]
                 if made.get("beside")
                 else []

@@ -42,13 +42,13 @@ from appliance.skills.catalogue import Catalogue
 BINS = 10
 
 
-BESIDE = "second"
-"""Folder, in that of a planner, of the model that is asked besides."""
+BESIDE = ("second", "third", "fourth")
+"""Folders, in that of a planner, of the models that are asked besides."""
 _FILES = ("genai_config.json", "model.onnx", "model.onnx.data", "tokenizer.json", "tokenizer_config.json")
 
 
 def export(
-    run: Path, folder: Path, *, precision: str = "int4", most: int = 0, beside: Path | None = None
+    run: Path, folder: Path, *, precision: str = "int4", most: int = 0, beside: Sequence[Path] = ()
 ) -> dict[str, object]:
     """Write the model folder; return the reliability curve and how large it is.
 
@@ -57,12 +57,14 @@ def export(
         folder: where to; must not exist.
         precision: int4, int8 or fp32, as the builder knows them.
         most: held-out pairs to calibrate on, drawn evenly from all; 0: all of them.
-        beside: folder of a planner whose model is asked besides; it must have the same tokens.
+        beside: folders of planners whose models are asked besides; they must have the same tokens.
 
     Raises:
-        NotFoundError: there is no planner in `beside`.
-        ConflictError: its tokens are others.
+        NotFoundError: there is no planner in one of `beside`.
+        ConflictError: its tokens are others, or they are too many.
     """
+    if len(beside) > len(BESIDE):
+        raise ConflictError(f"{len(beside)} models besides", remedy=f"give at most {len(BESIDE)}")
     catalogue = catalogue_of(run)
     tokens = Tokens.load(run)
     with tempfile.TemporaryDirectory() as scratch:
@@ -88,9 +90,9 @@ def export(
     recipe = json.loads((run / "recipe.json").read_text())
     twice = bool(recipe.get("twice"))
     card = card_of(tokens, catalogue, twice=twice)
-    if beside is not None:
-        _put_beside(folder, beside, card)
-        card = replace(card, beside=(BESIDE,))
+    for name, other in zip(BESIDE, beside, strict=False):
+        _put_beside(folder, name, other, card)
+        card = replace(card, beside=(*card.beside, name))
     write_card(folder, card)
     parts = split(corpus_examples(catalogue))
     write_evidence(folder, learn(parts.train, catalogue))
@@ -111,7 +113,7 @@ def export(
     return made
 
 
-def _put_beside(folder: Path, beside: Path, card: Card) -> None:
+def _put_beside(folder: Path, inside: str, beside: Path, card: Card) -> None:
     """Copy the model of another planner into a planner's folder."""
     other = read_card(beside)
     if other is None:
@@ -120,10 +122,10 @@ def _put_beside(folder: Path, beside: Path, card: Card) -> None:
         raise ConflictError(
             f"{beside} has other tokens than {folder}", remedy="give a planner of a run that began with the same one"
         )
-    (folder / BESIDE).mkdir()
+    (folder / inside).mkdir()
     for name in _FILES:
-        shutil.copyfile(beside / name, folder / BESIDE / name)
-    write_card(folder / BESIDE, replace(other, beside=()))
+        shutil.copyfile(beside / name, folder / inside / name)
+    write_card(folder / inside, replace(other, beside=()))
 
 
 def calibrate(
@@ -185,9 +187,14 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("folder", type=Path, help="where to")
     parser.add_argument("--precision", default="int4", choices=("int4", "int8", "fp32"))
     parser.add_argument("--most", type=int, default=0, help="held-out pairs to calibrate on; 0 for all")
-    parser.add_argument("--beside", help="a planner's folder, or `embedded`: its model is asked besides")
+    parser.add_argument(
+        "--beside",
+        action="append",
+        default=[],
+        help=f"a planner's folder, or `embedded`: its model is asked besides; at most {len(BESIDE)}",
+    )
     given = parser.parse_args(arguments)
-    beside = Path(folder_of(given.beside)) if given.beside else None
+    beside = [Path(folder_of(each)) for each in given.beside]
     made = export(given.run, given.folder, precision=given.precision, most=given.most, beside=beside)
     print(json.dumps(made, indent=1))
     return 0
