@@ -34,6 +34,8 @@ _TOGETHER = re.compile(
     r"\b(while|whilst|meanwhile|meantime|as (you|he|she|it|they|we)|as \w+ (is|goes|does|drives|flies)|same time|"
     r"simultaneous\w*|parallel|during|at once|along the way|on (the|your) way|all the while|throughout)\b"
 )
+_PLACE = re.compile(r"(.*\D) (\d+|[a-z])")
+"""A place of a kind of which there are several."""
 _HELD = re.compile(r"\b(hold|holding|held|holds|carrying|carries|you have|you've got|has got|in (its|your) gripper)\b")
 _FEEDS = {
     "encode_clip": ("extract_frames",),
@@ -200,7 +202,10 @@ def _feeds(subtask: Subtask, meaning: Meaning, reach: dict[str, frozenset[str]])
 
 
 def _moves(meaning: Meaning) -> Iterable[str]:
-    """A way to where the robot already is, up or down too, and a thing put down that was never picked up."""
+    """A way to where the robot already is, up or down too; a thing put down that was never picked up, or too far away.
+
+    A robot that was sent to dock 3 puts nothing down at dock 2: what is at hand is not of the kind of place it is at.
+    """
     where: dict[str, object] = {}
     height: dict[str, str] = {}
     held: set[tuple[str, object]] = set()
@@ -226,8 +231,12 @@ def _moves(meaning: Meaning) -> Iterable[str]:
             held.add((robot, subtask.params["object"]))
         elif subtask.skill == "handover":
             held.add((str(subtask.params["to"]), subtask.params["object"]))
-        elif subtask.skill == "place" and (robot, subtask.params["object"]) not in held and not holding:
-            yield f"{subtask.id}: {robot} puts down what it has not picked up"
+        elif subtask.skill == "place":
+            if (robot, subtask.params["object"]) not in held and not holding:
+                yield f"{subtask.id}: {robot} puts down what it has not picked up"
+            at, last = (_PLACE.fullmatch(str(each)) for each in (subtask.params.get("at"), where.get(robot)))
+            if at and last and at[1] == last[1] and at[2] != last[2]:
+                yield f"{subtask.id}: {robot} was sent to {last[0]}, and {at[0]} is another"
 
 
 def _travels(skill: str) -> bool:

@@ -24,6 +24,9 @@ ORDERS = (
     ("Kit_1 photographs the gate while Kit_2 films the fence for two minutes", ("kit_1", "kit_2"),
      ["photograph kit_1 target=gate", "record_video kit_2 duration_s=120 target=fence"]),
     ("drone 4 take off and then return home", ("drone_4",), ["takeoff drone_4", "return_home drone_4 < s1"]),
+    ("Rover_1 fetches the red box from dock 3 and places it at dock 2", ("rover_1",),
+     ["goto rover_1 place=dock 3", "pick rover_1 object=red box < s1", "goto rover_1 place=dock 2 < s2",
+      "place rover_1 at=dock 2 object=red box < s3"]),
 )  # fmt: skip
 
 
