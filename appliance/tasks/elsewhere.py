@@ -215,7 +215,6 @@ class Elsewhere:
 
     def _offer(self, run_id: str, offer: Offer, tries: _Tries, now: float) -> None:
         self._offers[run_id] = offer
-        task, subtask, _ = run_id.split("/")
         if not self._pool.withdraw(run_id):
             del self._offers[run_id]  # it has got a container this very moment
             return
@@ -224,6 +223,7 @@ class Elsewhere:
         if offer.anew:
             self._anew[offer.gateway] = now + ANEW_S
         else:
+            task, subtask, _ = run_id.split("/")
             self._promised[run_id] = self._remote.promise(offer.gateway, (task, subtask))
 
     def offer_of(self, run_id: str) -> Offer:

@@ -228,8 +228,8 @@ class RemoteContainers:
         before = self._sent.get(gateway, ())
         kept = self._sent[gateway] = [*self._open(gateway)[-MOST_PROMISED:], sent]
         for each in before:
-            if each not in kept:
-                self._runs.pop(each.run, None)
+            if not any(each is other for other in kept):
+                self._unwatch(each)
         self._runs[run] = sent
         return sent
 
@@ -246,8 +246,13 @@ class RemoteContainers:
         if sent is not None and sent.gateway == gateway and (status is None or not status.queue):
             self._drop(sent)
 
+    def _unwatch(self, sent: Sent) -> None:
+        # The next attempt at the same subtask may have been sent elsewhere meanwhile: that one is still waited for.
+        if self._runs.get(sent.run) is sent:
+            del self._runs[sent.run]
+
     def _drop(self, sent: Sent) -> None:
-        self._runs.pop(sent.run, None)
+        self._unwatch(sent)
         if sent.gateway in self._sent:
             self._sent[sent.gateway] = [each for each in self._sent[sent.gateway] if each is not sent]
 
@@ -370,7 +375,7 @@ class RemoteContainers:
 
     def _forget(self, gateway: str) -> None:
         for each in self._sent.pop(gateway, ()):
-            self._runs.pop(each.run, None)
+            self._unwatch(each)
         self._doubted.pop(gateway, None)
         self._round_trip_ms.pop(gateway, None)
         self._trust.pop(gateway, None)

@@ -233,6 +233,23 @@ async def test_runs_that_were_sent_are_not_remembered_for_ever(
     assert not remote.waits_for(("t1", "s4"))
 
 
+async def test_the_next_attempt_is_waited_for_when_the_one_before_is_given_up(
+    remote: RemoteContainers, plane: Any
+) -> None:
+    """The end of a run is heard where it was sent last, whatever becomes late of where it was sent before."""
+    know(plane, container("gw-2", "a"), container("gw-3", "b"))
+    plane.registry.ages = {"gw-2": 0.1, "gw-3": 0.1}
+    run = ("t1", "s1")
+    first = remote.promise("gw-2", run)
+    remote.turned_out(remote.promise("gw-3", run), good=True, container="b")
+    remote.turned_out(first, good=False)
+    remote._forget("gw-2")
+    assert remote.waits_for(run)
+    remote.over(run, "gw-3")
+    assert not remote.waits_for(run)
+    assert "b" in {each.id for each in remote.ready(NEED)}
+
+
 async def test_an_offer_that_came_to_nothing_holds_no_container(remote: RemoteContainers, plane: Any) -> None:
     """A run that was refused has none: when its gateway is believed again, all that are ready there count."""
     know(plane, container("gw-2", "a"))
