@@ -33,6 +33,7 @@ from appliance.errors import (
 from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
+from appliance.ports import free_port
 from appliance.record.settings import RecordConfig
 from appliance.robots.settings import MavlinkLink
 
@@ -115,13 +116,6 @@ def alive(process: Process) -> bool:
         return abs(found.create_time() - process.started) < 1.0 and found.status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
         return False
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A free loopback port; taken at once by the process it is for."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> FleetState:

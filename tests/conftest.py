@@ -19,6 +19,8 @@ import pytest
 import structlog
 from hypothesis import configuration, settings
 
+from appliance.ports import free_port as ask_port
+
 # Found examples are printed, not kept: no run depends on an earlier one, and the tree may be read-only.
 # No deadlines: how long an example takes says how busy the machine is.
 settings.register_profile("alone", database=None, deadline=None)
@@ -98,22 +100,13 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
-def _ask_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture
 def free_ports() -> Callable[..., list[int]]:
     """Return a function `free_ports(n, udp=False)`: n different loopback ports that are free just now."""
 
     def ask(count: int, *, udp: bool = False) -> list[int]:
         kind = socket.SOCK_DGRAM if udp else socket.SOCK_STREAM
-        ports: set[int] = set()
-        while len(ports) < count:
-            ports.add(_ask_port(kind))
-        return sorted(ports)
+        return sorted(ask_port(kind) for _ in range(count))
 
     return ask
 
@@ -121,13 +114,13 @@ def free_ports() -> Callable[..., list[int]]:
 @pytest.fixture
 def free_port() -> int:
     """Return a loopback TCP port that is free just now."""
-    return _ask_port(socket.SOCK_STREAM)
+    return ask_port()
 
 
 @pytest.fixture
 def free_udp_port() -> int:
     """Return a loopback UDP port that is free just now."""
-    return _ask_port(socket.SOCK_DGRAM)
+    return ask_port(socket.SOCK_DGRAM)
 
 
 @pytest.fixture(scope="session")

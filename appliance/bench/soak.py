@@ -24,11 +24,12 @@ from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, PoolError, SwiftbotError
 from appliance.gateway import Gateway
 from appliance.llm.settings import LlmConfig
-from appliance.local_fleet import free_port, remove_containers
+from appliance.local_fleet import remove_containers
 from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunRequest
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import LABEL_FLEET, PodmanEngine
 from appliance.pool.settings import PoolConfig
+from appliance.ports import free_port
 from appliance.tasks.api import RunAsk
 
 CONTAINERS = 4

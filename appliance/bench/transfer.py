@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import os
 import secrets
-import socket
 import statistics
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.settings import TransferConfig
 from appliance.pool.transfer.transfers import Transfers
 from appliance.pool.volumes import Volumes
+from appliance.ports import free_port
 
 _READY_S = 60.0
 _LINE = b"2.718281828 x=1.250 y=3.500 theta=0.100 battery=0.87\n"
@@ -50,7 +50,7 @@ async def run(
     shares: list[float] = []
     try:
         with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
-            ends = [f"tcp/127.0.0.1:{port}" for port in _free_ports(2)]
+            ends = [f"tcp/127.0.0.1:{port}" for port in (free_port(), free_port())]
             async with (
                 _gateway(Path(folder) / "here", fleet, "here", ends, podman_url) as (plane, transfers, _, storage),
                 _other(Path(folder) / "there", fleet, ends, podman_url) as change,
@@ -80,14 +80,6 @@ async def run(
     for what, rate in handled.items():
         result[what] = round(megabytes * 2**20 / rate * 1e3, 1) if rate else None
     return result | {"wire_share": round(statistics.median(shares), 3)}
-
-
-def _free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [int(probe.getsockname()[1]) for probe in probes]
 
 
 @contextlib.asynccontextmanager

@@ -19,12 +19,12 @@ from moving_bench import counting, ended, pretty, write_skills
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
-from appliance.local_fleet import free_port
 from appliance.model import Notice, TaskState
 from appliance.plane.router import run_router
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
+from appliance.ports import free_port
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.settings import TasksConfig
 

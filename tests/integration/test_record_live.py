@@ -13,10 +13,10 @@ import msgspec
 import pytest
 
 from appliance.errors import ConfigError
-from appliance.local_fleet import free_port
 from appliance.model import GatewayStatus, LogLine, Pose, RobotInfo, Site, encode
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
+from appliance.ports import free_port
 from appliance.record import live
 from appliance.record.about import About
 from appliance.record.facts import LoggedMessage

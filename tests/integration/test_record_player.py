@@ -10,11 +10,11 @@ from mcap.writer import Writer
 from msgspec.structs import replace
 
 from appliance.errors import RefusedError
-from appliance.local_fleet import free_port
 from appliance.model import GatewayStatus, encode
 from appliance.plane.keys import Keys
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
+from appliance.ports import free_port
 from appliance.record.asking import replay, steer
 from appliance.record.edit import Select
 from appliance.record.facts import LoggedMessage

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from appliance import cli
-from appliance.local_fleet import free_port
+from appliance.ports import free_port
 from appliance.record.reader import info, read
 
 CUT_AWAY = 80_000

@@ -19,9 +19,9 @@ import uvloop
 import zenoh
 
 from appliance.bench.dht.node import tell
-from appliance.local_fleet import free_port
 from appliance.plane import link, threads
 from appliance.plane.settings import PlaneConfig
+from appliance.ports import free_port
 
 ANSWER_S = 10.0
 

@@ -30,9 +30,9 @@ from appliance.bench.dht import node
 from appliance.bench.dht.node import NodeOptions
 from appliance.bench.figures import ratio, summary
 from appliance.errors import SwiftbotError
-from appliance.local_fleet import free_port
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
+from appliance.ports import free_port
 
 KSIZE = 5
 """Copies of a value there; the package's own default, 20, would store it on every node."""

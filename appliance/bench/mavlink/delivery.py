@@ -26,9 +26,10 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
 from appliance.llm.settings import LlmConfig
-from appliance.local_fleet import Order, free_port
+from appliance.local_fleet import Order
 from appliance.model import Notice, TaskState
 from appliance.pool.settings import PoolConfig
+from appliance.ports import free_port
 from appliance.robots.api import LinkAdd
 from appliance.robots.client import TaskClient, TaskRejected
 from appliance.robots.settings import MavlinkLink

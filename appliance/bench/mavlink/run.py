@@ -7,7 +7,6 @@ has to come out at the other side, byte for byte and in order, and stand in the 
 import asyncio
 import contextlib
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -27,6 +26,7 @@ from appliance.bench.mavlink.host import FLEET, Host, Told
 from appliance.bench.mavlink.player import Play, Played, save
 from appliance.errors import PrerequisiteError
 from appliance.plane.keys import Keys
+from appliance.ports import free_port
 from appliance.record.reader import read
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.frames import check
@@ -137,7 +137,7 @@ class _Bench:
     ) -> dict[str, Any]:
         """Play through the gateway's robots, in a process of their own."""
         self._number += 1
-        vehicle, ground, zenoh = _free_ports(3)
+        vehicle, ground, zenoh = free_port(), free_port(), free_port()
         folder = self._folder / f"run-{self._number}"
         folder.mkdir()
         links = tuple(MavlinkLink(listen=f"tcp://127.0.0.1:{port}", prefix="drone_") for port in (vehicle, ground))
@@ -183,7 +183,7 @@ class _Bench:
 
     async def other(self, found: others.Found, records: Sequence[tlog.Record], *, rounds: int) -> dict[str, Any]:
         """Play through another router."""
-        vehicle, ground = _free_ports(2)
+        vehicle, ground = free_port(), free_port()
         folder = self._folder / found.other.name
         folder.mkdir()
         arguments = found.other.arguments(folder, (vehicle, ground))
@@ -327,15 +327,3 @@ async def _process(*arguments: str, program: str = _PYTHON) -> AsyncGenerator[as
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
-
-
-def _free_ports(count: int) -> list[int]:
-    """Return loopback ports that are free just now."""
-    sockets = [socket.socket() for _ in range(count)]
-    try:
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [int(each.getsockname()[1]) for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()

@@ -24,10 +24,10 @@ from msgspec import Struct
 from appliance.bench.figures import summary
 from appliance.bench.members.host import HostOptions
 from appliance.errors import DeadlineError, SwiftbotError
-from appliance.local_fleet import free_port
 from appliance.plane.overlay.view import bound_for
 from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
+from appliance.ports import free_port
 
 Progress = Callable[[str], None]
 PATIENCE_S = 300.0

@@ -17,7 +17,7 @@ import msgspec
 from appliance.bench.recording import writing
 from appliance.bench.recording.processes import FLEET, Job
 from appliance.errors import DeadlineError, SwiftbotError
-from appliance.local_fleet import free_port
+from appliance.ports import free_port
 from appliance.record.edit import recover
 from appliance.record.reader import info, read
 

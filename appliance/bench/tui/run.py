@@ -5,7 +5,6 @@ Each UI looks at a fleet of its own, one after the other, so that neither pays f
 
 import asyncio
 import os
-import socket
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +15,7 @@ from appliance.bench.pooled import fleet_name
 from appliance.bench.tui.feed import Size
 from appliance.bench.tui.screen import COLUMNS, LINES, Look
 from appliance.errors import SwiftbotError
+from appliance.ports import free_port
 
 Progress = Callable[[str], None]
 
@@ -47,7 +47,7 @@ async def run(
     for name in ("ui", "plain_table") if plain else ("ui",):
         progress(f"{name}: {seconds:.0f} s at {rate} updates/s")
         size = Size(
-            fleet=fleet_name(), listen=f"tcp/127.0.0.1:{_free_port()}", gateways=gateways, robots=robots, tasks=tasks,
+            fleet=fleet_name(), listen=f"tcp/127.0.0.1:{free_port()}", gateways=gateways, robots=robots, tasks=tasks,
             rate=rate,
         )  # fmt: skip
         result[name] = await _one(size, seconds, plain=name == "plain_table")
@@ -89,9 +89,3 @@ async def _line(process: asyncio.subprocess.Process, name: str) -> bytes:
         if line.startswith((b"{", b"ready")):
             return line
     raise SwiftbotError(f"the process {name} of the measurement ended early", remedy="its error stands above")
-
-
-def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])

@@ -13,6 +13,7 @@ from typing import Any, cast
 import msgspec
 
 from appliance.model import RobotInfo, Site, TaskRecord, TaskRequest
+from appliance.ports import free_port
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, make
 from appliance.robots.mavlink.station import Station
@@ -125,7 +126,7 @@ class Outside:
             return MavlinkLink(connect=f"serial:{os.ttyname(slave)}:57600")
         scheme, _, way = self.kind.partition(" ")
         if way == "listen":
-            self._port = port_of(socket.SOCK_DGRAM if scheme == "udp" else socket.SOCK_STREAM)
+            self._port = free_port(socket.SOCK_DGRAM if scheme == "udp" else socket.SOCK_STREAM)
             return MavlinkLink(listen=f"{scheme}://127.0.0.1:{self._port}")
         if scheme == "udp":
             outside = self
@@ -182,7 +183,7 @@ async def beside(
     kind: str, signing: str = "", **changes: Any
 ) -> AsyncIterator[tuple[Station, dict[str, int], Outside, Callable[[bytes], None]]]:
     """Open a station with a link of that kind, whose other end the test has, and another link with a vehicle."""
-    port, outside = port_of(), Outside(kind)
+    port, outside = free_port(socket.SOCK_DGRAM), Outside(kind)
     async with AsyncExitStack() as closing:
         link = msgspec.structs.replace(await outside.prepare(closing), signing=signing)
         made, refused = await closing.enter_async_context(station(port, link, **changes))
@@ -225,10 +226,3 @@ def states_told(made: Station) -> list[RobotInfo]:
     """Return what was told of robots, in order."""
     session = cast("Wire", made._session)
     return [msgspec.json.decode(value, type=RobotInfo) for key, value in session.puts if key.endswith("/state")]
-
-
-def port_of(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """Return a loopback port that is free just now."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

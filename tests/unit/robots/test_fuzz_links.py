@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import random
+import socket
 import struct
 import tracemalloc
 from typing import Any, cast
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from appliance.ports import free_port
 from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Stream, make
 from appliance.robots.mavlink.kinds import KINDS, checksum, decode
 from appliance.robots.mavlink.signing import Signer
@@ -22,7 +24,6 @@ from tests.unit.robots.links import (
     STATION,
     Wire,
     beside,
-    port_of,
     served,
     station,
     tunnel_of,
@@ -190,7 +191,7 @@ def _storm(chance: random.Random, count: int) -> list[tuple[bytes, tuple[str, in
 @pytest.mark.thorough
 async def test_a_flood_of_everything_costs_no_memory() -> None:
     """Frames that make a gateway remember something, from ever other senders: what is kept does not grow with them."""
-    async with station(port_of(), sender_hz=0.0, repeat_s=0.01, max_vehicles=8) as (made, refused):
+    async with station(free_port(socket.SOCK_DGRAM), sender_hz=0.0, repeat_s=0.01, max_vehicles=8) as (made, refused):
         session = cast("Wire", made._session)
         (entry,) = tuple(made.links)
         # The addresses are made up, so nothing may be sent to them.

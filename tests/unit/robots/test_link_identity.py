@@ -1,6 +1,7 @@
 """Who is who on links: signed frames played again, two with one system id, repetitions, ends of MAVLink 1 alone."""
 
 import asyncio
+import socket
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import Site
+from appliance.ports import free_port
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.signing import Signer
 from appliance.robots.mavlink.station import Station
@@ -21,7 +23,6 @@ from tests.unit.robots.links import (
     STATION,
     Wire,
     beside,
-    port_of,
     sender,
     states_told,
     station,
@@ -77,7 +78,7 @@ async def test_two_vehicles_with_one_system_id_on_two_links(kind: str) -> None:
 @given(st.lists(st.booleans(), min_size=10, max_size=60))
 async def test_two_vehicles_with_one_system_id_in_any_order(order: list[bool]) -> None:
     """However their frames mix: what is told of the robot is what the first one says, and the other is counted."""
-    port = port_of()
+    port = free_port(socket.SOCK_DGRAM)
     async with station(port) as (made, refused), sender(port) as first, sender(port) as second:
         one, two = Codec(1, 1), Codec(1, 1)
         await until(lambda: made.attached, lambda: first(one.pack(make("HEARTBEAT", **BEAT))))
@@ -94,7 +95,7 @@ async def test_two_vehicles_with_one_system_id_in_any_order(order: list[bool]) -
 
 async def test_two_vehicles_with_one_system_id() -> None:
     """The first one is believed, the other's frames are counted and its place is not taken."""
-    port = port_of()
+    port = free_port(socket.SOCK_DGRAM)
     async with station(port) as (made, refused), sender(port) as first, sender(port) as second:
         one, two = Codec(1, 1), Codec(1, 1)
         await until(lambda: made.attached, lambda: first(one.pack(make("HEARTBEAT", **BEAT))))
@@ -110,7 +111,7 @@ async def test_two_vehicles_with_one_system_id() -> None:
 
 async def test_an_end_that_understands_mavlink_1_alone() -> None:
     """It is a vehicle like others: what it is told, by the gateway or from another link, is in MAVLink 1."""
-    port, other = port_of(), port_of()
+    port, other = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
     heard: list[bytes] = []
 
     class Old(asyncio.DatagramProtocol):
@@ -150,7 +151,7 @@ async def test_an_end_that_understands_mavlink_1_alone() -> None:
 
 async def test_a_repetition_is_recorded_and_goes_no_further() -> None:
     """What comes twice stands in the log twice, under who said it, and another end gets it once."""
-    port, other = port_of(), port_of()
+    port, other = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
     async with (
         station(port, MavlinkLink(listen=f"udp://127.0.0.1:{other}"), repeat_s=600.0) as (made, refused),
         sender(port) as vehicle,
@@ -185,7 +186,7 @@ async def test_a_recorded_signed_link_played_again(tmp_path: Any) -> None:
     key = tmp_path / "key"
     key.write_text("hex:" + KEY.hex())
     key.chmod(0o600)
-    port, store = port_of(), FakeStore()
+    port, store = free_port(socket.SOCK_DGRAM), FakeStore()
     codec = Codec(1, 1, signer=Signer(KEY, link_id=1))
     recorded: list[bytes] = []
     for _ in range(2):
