@@ -146,8 +146,8 @@ async def _our_side(stack: AsyncExitStack, nodes: int, folder: Path, layout: Lay
         )  # fmt: skip
         command = (sys.executable, "-m", "appliance.bench.dht.node", msgspec.json.encode(options).decode())
         processes.append(await stack.enter_async_context(_process(*command)))
-    for process in processes:
-        await line_of(process, "ready")
+    # All at once: one that could not start is why the others wait for it.
+    await asyncio.gather(*(line_of(process, "ready") for process in processes))
     return _Processes(processes, copies=PlaneConfig().replicas)
 
 
