@@ -18,19 +18,24 @@ from appliance.plane.wire import Closer, Wire
 log = structlog.get_logger(__name__)
 
 
+Handler = Callable[[str, bytes], Awaitable[bytes]]
+"""Answers a question for a key, on the event loop."""
+
+
 class Answering:
     """What is served on one session."""
 
     def __init__(self, wire: Wire, doors: Doors, direct: Direct) -> None:
-        self._wire = wire
+        self.wire = wire
         self._doors = doors
         self._direct = direct
+        self.direct_answer = direct.answer
         self._answering: set[asyncio.Task[None]] = set()
 
     def serve(
         self,
         expr: str,
-        handler: Callable[[str, bytes], Awaitable[bytes]],
+        handler: Handler,
         *,
         bulk: bool = False,
         direct: bool = False,
@@ -50,62 +55,9 @@ class Answering:
         been seen to deliver a query to the wrong queryable of a session or process, which made one robot do another's
         command. `query` writes down for whom it is; what other Zenoh clients ask says nothing of it.
         """
-        limit, running, name = self._wire.config.max_payload_bytes, set[asyncio.Task[None]](), self._wire.name(expr)
-        door = None if "*" in expr else expr.encode()
-
-        def take(query: zenoh.Query) -> None:
-            payload = query.payload
-            size = len(payload) if payload is not None else 0
-            marked, meant = link.read_mark(query)
-            reply = partial(self._reply, query, expr, bulk, marked)
-            if meant and door is not None and meant != door:
-                error = UnreachableError(f"{expr}: {link.WRONG_DOOR}", remedy="ask again in a moment")
-                begin = partial(self._misrouted, name, expr, link.asker_of(query), reply, error)
-                size = 0
-            elif size > limit:
-                error = PayloadError(f"{query.key_expr}: {size:,} bytes", remedy=f"at most {limit:,}")
-                begin = partial(self._refuse, f"oversize {name}", str(query.key_expr), reply, error)
-                size = 0
-            else:
-                data = payload.to_bytes() if payload is not None else b""
-                if at_once is not None and marked and at_once(data, partial(link.reply_direct, query, expr)):
-                    return
-                begin = partial(answer, str(query.key_expr), data, reply)
-            if not self._wire.inbox.post(begin, size):
-                link.reply(query, expr, None, RefusedError("too busy", remedy="try again in a moment"))
-
-        def take_direct(asked: Asked, payload: zenoh.ZBytes) -> None:
-            size = len(payload)
-            reply = partial(self._direct.answer, asked)
-            if asked.key != door:
-                # Asked again as a query it is refused, and whoever asked learns by whom.
-                error = UnreachableError(f"{expr}: {link.WRONG_DOOR}")
-                begin = partial(self._refuse, f"misrouted {name}", expr, partial(_again, reply), error)
-                size = 0
-            elif size > link.MOST_DIRECT:
-                error = PayloadError(f"{expr}: {size:,} bytes", remedy=f"at most {link.MOST_DIRECT:,} in a message")
-                begin = partial(self._refuse, f"oversize {name}", expr, reply, error)
-                size = 0
-            else:
-                data = payload.to_bytes()
-                if at_once is not None and at_once(data, reply):
-                    return
-                begin = partial(answer, expr, data, reply)
-            if not self._wire.inbox.post(begin, size):
-                reply(None, RefusedError("too busy", remedy="try again in a moment"))
-
-        def answer(key: str, data: bytes, reply: Answer) -> None:
-            if len(running) >= self._wire.config.concurrent_queries:
-                error = RefusedError(f"{key}: {len(running)} queries are being answered", remedy="try again later")
-                self._refuse(f"too many {name}", key, reply, error)
-                return
-            task = self._wire.loop.create_task(self._answer(handler, name, key, data, reply))
-            for group in (running, self._answering):
-                group.add(task)
-                task.add_done_callback(group.discard)
-
-        queryable = self._wire.raw.declare_queryable(expr, threads.callback(take), complete=True)
-        messages = self._direct.serve(expr, take_direct) if direct else None
+        served = Served(self, expr, handler, bulk=bulk, at_once=at_once)
+        queryable = self.wire.raw.declare_queryable(expr, threads.callback(served.take), complete=True)
+        messages = self.take_messages(served) if direct else None
 
         def end() -> None:
             if messages is not None:
@@ -114,9 +66,24 @@ class Answering:
 
         return Closer(end)
 
+    def take_messages(self, served: "Served") -> Closer:
+        """Have the direct questions for a key come as plain messages too."""
+        return self._direct.serve(served.expr, served.take_message)
+
+    def begin(self, served: "Served", key: str, data: bytes, reply: Answer) -> None:
+        """Have a handler answer, unless too many are at it; on the event loop's thread."""
+        if len(served.running) >= self.wire.config.concurrent_queries:
+            error = RefusedError(f"{key}: {len(served.running)} queries are being answered", remedy="try again later")
+            self.refuse(f"too many {served.name}", key, reply, error)
+            return
+        task = self.wire.loop.create_task(self._answer(served.handler, served.name, key, data, reply))
+        for group in (served.running, self._answering):
+            group.add(task)
+            task.add_done_callback(group.discard)
+
     async def _answer(
         self,
-        handler: Callable[[str, bytes], Awaitable[bytes]],
+        handler: Handler,
         name: str,
         key: str,
         data: bytes,
@@ -126,11 +93,11 @@ class Answering:
         error: SwiftbotError | None = None
         try:
             answer = await handler(key, data)
-            if len(answer) > self._wire.config.max_payload_bytes:
+            if len(answer) > self.wire.config.max_payload_bytes:
                 error = PayloadError(f"{key}: the answer has {len(answer):,} bytes", remedy="ask for less at once")
         except SwiftbotError as refusal:
             if isinstance(refusal, PayloadError):
-                self._wire.refuse(f"malformed {name}", key=key, reason=str(refusal))
+                self.wire.refuse(f"malformed {name}", key=key, reason=str(refusal))
             error = refusal
         except asyncio.CancelledError:
             error = UnreachableError("whoever was asked is stopping", remedy="ask another gateway")
@@ -141,25 +108,26 @@ class Answering:
         finally:
             reply(answer, error)
 
-    def _reply(
+    def reply(
         self, query: zenoh.Query, expr: str, bulk: bool, marked: bool, answer: bytes | None, error: SwiftbotError | None
     ) -> None:
         """Answer a query; one marked as direct from here, others on the sender's thread."""
-        if self._wire.closed:
+        if self.wire.closed:
             link.reply(query, expr, answer, error)
         elif marked:
             link.reply_direct(query, expr, answer, error)
         else:
             size = len(answer) if answer is not None and error is None else 0
-            self._wire.send(expr, partial(link.reply, query, expr, answer, error, bulk=bulk), size, bulk=bulk)
+            self.wire.send(expr, partial(link.reply, query, expr, answer, error, bulk=bulk), size, bulk=bulk)
 
-    def _misrouted(self, name: str, expr: str, asker: str, reply: Answer, error: SwiftbotError) -> None:
+    def misrouted(self, name: str, expr: str, asker: str, reply: Answer, error: SwiftbotError) -> None:
         """Refuse a question for another key; the links over which it came may be mixed up."""
-        self._refuse(f"misrouted {name}", expr, reply, error)
+        self.refuse(f"misrouted {name}", expr, reply, error)
         self._doors.was_wrong(asker)
 
-    def _refuse(self, what: str, key: str, reply: Answer, error: SwiftbotError) -> None:
-        self._wire.refuse(what, key=key, reason=str(error))
+    def refuse(self, what: str, key: str, reply: Answer, error: SwiftbotError) -> None:
+        """Refuse a question as bad input, which is counted."""
+        self.wire.refuse(what, key=key, reason=str(error))
         reply(None, error)
 
     async def stop(self, wait_s: float) -> None:
@@ -168,6 +136,79 @@ class Answering:
             task.cancel()
         if self._answering:
             await asyncio.wait(self._answering, timeout=wait_s)
+
+
+class Served:
+    """What answers the questions for one key, or for those of an expression; `take`, on Zenoh's threads, has them."""
+
+    def __init__(
+        self,
+        answering: Answering,
+        expr: str,
+        handler: Handler,
+        *,
+        bulk: bool = False,
+        at_once: Callable[[bytes, Answer], bool] | None = None,
+    ) -> None:
+        self.expr, self.handler = expr, handler
+        self.name = answering.wire.name(expr)
+        self.running: set[asyncio.Task[None]] = set()
+        self._answering, self._wire = answering, answering.wire
+        self._direct_answer = answering.direct_answer
+        self._door = None if "*" in expr else expr.encode()
+        self._bulk, self._at_once = bulk, at_once
+
+    def take(self, query: zenoh.Query) -> None:
+        """A question came."""
+        self.take_marked(query, *link.read_mark(query))
+
+    def take_marked(self, query: zenoh.Query, marked: bool, meant: bytes) -> None:
+        """The same, with what it says of itself read (`link.read_mark`)."""
+        answering, limit = self._answering, self._wire.config.max_payload_bytes
+        payload = query.payload
+        size = len(payload) if payload is not None else 0
+        reply = partial(answering.reply, query, self.expr, self._bulk, marked)
+        if meant and self._door is not None and meant != self._door:
+            error = UnreachableError(f"{self.expr}: {link.WRONG_DOOR}", remedy="ask again in a moment")
+            begin = partial(answering.misrouted, self.name, self.expr, link.asker_of(query), reply, error)
+            size = 0
+        elif size > limit:
+            error = PayloadError(f"{query.key_expr}: {size:,} bytes", remedy=f"at most {limit:,}")
+            begin = partial(answering.refuse, f"oversize {self.name}", str(query.key_expr), reply, error)
+            size = 0
+        else:
+            data = payload.to_bytes() if payload is not None else b""
+            if (
+                self._at_once is not None
+                and marked
+                and self._at_once(data, partial(link.reply_direct, query, self.expr))
+            ):
+                return
+            begin = partial(answering.begin, self, str(query.key_expr), data, reply)
+        if not self._wire.inbox.post(begin, size):
+            link.reply(query, self.expr, None, RefusedError("too busy", remedy="try again in a moment"))
+
+    def take_message(self, asked: Asked, payload: zenoh.ZBytes) -> None:
+        """A direct question came as a plain message."""
+        answering, expr = self._answering, self.expr
+        size = len(payload)
+        reply = partial(self._direct_answer, asked)
+        if asked.key != self._door:
+            # Asked again as a query it is refused, and whoever asked learns by whom.
+            error = UnreachableError(f"{expr}: {link.WRONG_DOOR}")
+            begin = partial(answering.refuse, f"misrouted {self.name}", expr, partial(_again, reply), error)
+            size = 0
+        elif size > link.MOST_DIRECT:
+            error = PayloadError(f"{expr}: {size:,} bytes", remedy=f"at most {link.MOST_DIRECT:,} in a message")
+            begin = partial(answering.refuse, f"oversize {self.name}", expr, reply, error)
+            size = 0
+        else:
+            data = payload.to_bytes()
+            if self._at_once is not None and self._at_once(data, reply):
+                return
+            begin = partial(answering.begin, self, expr, data, reply)
+        if not self._wire.inbox.post(begin, size):
+            reply(None, RefusedError("too busy", remedy="try again in a moment"))
 
 
 def _again(reply: Answer, _: bytes | None, __: SwiftbotError | None) -> None:

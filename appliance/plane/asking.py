@@ -226,8 +226,7 @@ class Question:
         self._on_answer(data, error)
 
     def _on_end(self, sent: bool) -> None:
-        remedy = "is that gateway or robot up and linked?"
-        self._on_answer(None, UnreachableError(f"nobody answers on {self._key}", remedy=remedy, sent=sent))
+        self._on_answer(None, UnreachableError(f"nobody answers on {self._key}", remedy=link.NOBODY_REMEDY, sent=sent))
 
     def _on_time(self) -> None:
         self._on_answer(None, DeadlineError(f"no answer on {self._key} within {self._timeout_s:g} s"))

@@ -70,6 +70,7 @@ MOST_DIRECT = 32 * 1024
 MOST_ERROR = 65_536
 """Bytes that are read of an error."""
 WRONG_DOOR = "the question is not for this"
+NOBODY_REMEDY = "is that gateway or robot up and linked?"
 
 
 def mark(key: str, *, direct: bool) -> bytes:

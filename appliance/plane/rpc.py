@@ -1,4 +1,4 @@
-"""Requests from one gateway to another: a verb is a queryable `gw/{gateway}/rpc/{verb}`, JSON in and out.
+"""Requests from one gateway to another: a verb is a query on `gw/{gateway}/rpc/{verb}`, JSON in and out.
 
 Queries cannot be subscribed to, so the answering gateway puts a record of each exchange where the recorder and
 any Zenoh client can see it; what would be too large there is named by its digest.
@@ -16,7 +16,7 @@ from msgspec import Raw, Struct
 from appliance.errors import ConfigError, PayloadError, SwiftbotError
 from appliance.model import ErrorReply, encode
 from appliance.plane.asking import Question
-from appliance.plane.session import Answer, Closer, Session
+from appliance.plane.session import Answer, Session
 
 Q = TypeVar("Q", bound=Struct)
 R = TypeVar("R", bound=Struct)
@@ -80,8 +80,8 @@ class Rpc:
         """Counts bad input of those that are asked or ask."""
         self._session = session
         self._gateway = gateway
-        self._verbs: dict[str, Callable[[bytes], Awaitable[bytes]]] = {}
-        self._closers: list[Closer] = []
+        self._verbs = None if gateway is None else session.serve_verbs(session.keys.verbs(gateway))
+        self._registered = set[str]()
 
     def register(
         self,
@@ -99,7 +99,7 @@ class Rpc:
         of Zenoh's (`Session.serve`); bad input is the handler's.
         """
         gateway = self._gateway
-        if gateway is None or verb in self._verbs:
+        if gateway is None or self._verbs is None or verb in self._registered:
             raise ConfigError(f"the verb {verb} cannot be served here")
         decoder = msgspec.json.Decoder(request)
 
@@ -125,9 +125,8 @@ class Rpc:
             return reply
 
         quick = None if at_once is None else partial(_at_once, msgspec.json.Decoder(request), at_once)
-        self._verbs[verb] = serve
-        key = self._session.keys.rpc(gateway, verb)
-        self._closers.append(self._session.serve(key, lambda _, payload: serve(payload), direct=direct, at_once=quick))
+        self._registered.add(verb)
+        self._verbs.add(verb, lambda _, payload: serve(payload), direct=direct, at_once=quick)
 
     def _publish(self, verb: str, gateway: str, payload: bytes, began: float, outcome: bytes | Exception) -> None:
         reply, error = (outcome, None) if isinstance(outcome, bytes) else (None, _failure(outcome))
@@ -164,8 +163,8 @@ class Rpc:
 
     def close(self) -> None:
         """Answer no more."""
-        for closer in self._closers:
-            closer.close()
+        if self._verbs is not None:
+            self._verbs.close()
 
 
 def _at_once(

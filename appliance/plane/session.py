@@ -12,6 +12,7 @@ Its parts are `publishing` (facts), `answering` and `asking` (questions), `direc
 # The library's stubs leave out the return types of methods that return nothing.
 
 import asyncio
+from functools import partial
 
 import zenoh
 
@@ -25,6 +26,7 @@ from appliance.plane.presence import Presence
 from appliance.plane.publishing import Message, Publishing
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.sockets import SocketWatch
+from appliance.plane.verbs import Verbs
 from appliance.plane.wire import Closer, Wire
 
 __all__ = ["Answer", "Closer", "Message", "Session"]
@@ -55,6 +57,7 @@ class Session:
         self.subscribe = publishing.subscribe
         self.subscribe_typed = publishing.subscribe_typed
         self.serve = self._answering.serve
+        self.serve_verbs = partial(Verbs, self._answering)
         self.query = self._asking.query
         self.ask = self._asking.ask
         self.query_all = self._asking.query_all
