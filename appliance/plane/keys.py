@@ -57,13 +57,9 @@ class Keys:
         """Put: ContainerInfo; delete when it is gone."""
         return f"{self.root}/gw/{gateway}/pool/{container}"
 
-    def rpc(self, gateway: str, verb: str) -> str:
+    def rpc(self, gateway: str, verb: str = "*") -> str:
         """Queryable: a request to one gateway, answered with the verb's reply or ErrorReply."""
         return f"{self.root}/gw/{gateway}/rpc/{verb}"
-
-    def verbs(self, gateway: str) -> str:
-        """What the keys of all requests to one gateway begin with (`rpc`)."""
-        return f"{self.root}/gw/{gateway}/rpc"
 
     def direct(self, gateway: str, verb: str) -> str:
         """Put by the asking gateway: a small question to one gateway, as a message (`plane.direct`)."""

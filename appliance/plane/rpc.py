@@ -80,7 +80,7 @@ class Rpc:
         """Counts bad input of those that are asked or ask."""
         self._session = session
         self._gateway = gateway
-        self._verbs = None if gateway is None else session.serve_verbs(session.keys.verbs(gateway))
+        self._verbs = None if gateway is None else session.serve_verbs(session.keys.rpc(gateway))
         self._registered = set[str]()
 
     def register(

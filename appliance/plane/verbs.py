@@ -1,8 +1,8 @@
-"""All verbs of a gateway behind one queryable, `{prefix}/*`.
+"""All verbs of a gateway behind one queryable, `gw/{gateway}/rpc/*`.
 
-A queryable for each would be some eighty of a gateway, and Zenoh tells every session of each and compares every new key
-with all of them: of the processor time until a restarted gateway of eight was linked, the larger part. The recorder and
-other clients of Zenoh see no difference: the keys are the same.
+A queryable for each would be some eighty of a gateway, and Zenoh tells every session of each and compares every key with
+all of them: with eight gateways on two cores one that was restarted showed its token 30 ms after its session was open, and
+19 ms with one queryable. The recorder and other clients of Zenoh see no difference: the keys are the same.
 """
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # The library's stubs leave out the return types of methods that return nothing.
@@ -19,16 +19,15 @@ from appliance.plane.wire import Closer
 
 
 class Verbs:
-    """The verbs under one prefix; those that are not there are answered as nobody would be."""
+    """The verbs of `expr`, which ends in `/*`; one that is not there is answered as where nobody is."""
 
-    def __init__(self, answering: Answering, prefix: str) -> None:
+    def __init__(self, answering: Answering, expr: str) -> None:
         self._answering = answering
-        self._prefix, self._below = prefix, f"{prefix}/".encode()
-        self._served: dict[bytes, Served] = {}
-        everything = f"{prefix}/*"
-        self._nobody = Served(answering, everything, _nobody)
-        self._wrong = Served(answering, prefix, _nobody)
-        queryable = answering.wire.raw.declare_queryable(everything, threads.callback(self._take), complete=True)
+        self._prefix = expr.removesuffix("*")
+        self._served: dict[str, Served] = {}
+        self._nobody = Served(answering, expr, _nobody)
+        self._wrong = Served(answering, self._prefix.removesuffix("/"), _nobody)
+        queryable = answering.wire.raw.declare_queryable(expr, threads.callback(self._take), complete=True)
         self._closers = [Closer(queryable.undeclare)]
 
     def add(
@@ -40,18 +39,17 @@ class Verbs:
         at_once: Callable[[bytes, Answer], bool] | None = None,
     ) -> None:
         """Answer a verb from now on; the rest as of `Session.serve`."""
-        served = self._served[verb.encode()] = Served(
-            self._answering, f"{self._prefix}/{verb}", handler, at_once=at_once
-        )
+        served = self._served[verb] = Served(self._answering, f"{self._prefix}{verb}", handler, at_once=at_once)
         if direct:
             self._closers.append(self._answering.take_messages(served))
 
     def _take(self, query: zenoh.Query) -> None:
         marked, meant = link.read_mark(query)
-        # What the asker wrote down is right even where links are mixed up; other clients of Zenoh write nothing.
-        key = meant or str(query.key_expr).encode()
-        astray = meant and not meant.startswith(self._below)
-        served = self._wrong if astray else self._served.get(key.rpartition(b"/")[2], self._nobody)
+        key = str(query.key_expr)
+        served = self._served.get(key.rpartition("/")[2])
+        if served is None:
+            # Other clients of Zenoh do not write down what they mean.
+            served = self._nobody if not meant or meant == key.encode() else self._wrong
         served.take_marked(query, marked, meant)
 
     def close(self) -> None:

@@ -4,61 +4,33 @@ import asyncio
 import contextlib
 import gc
 import itertools
-import json
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import msgspec
 import pytest
 import zenoh
+from plane_fleet import until
+from plane_pair import LIMIT, heard, linked_pair
 
 from appliance.errors import (
-    ConfigError,
-    DeadlineError,
     PayloadError,
-    PlanError,
     RefusedError,
-    SwiftbotError,
     UnreachableError,
 )
-from appliance.model import ErrorReply, LogLine, Need, encode
+from appliance.model import ErrorReply, LogLine, encode
 from appliance.plane import asking
-from appliance.plane.rpc import Exchange, Rpc
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
 
 pytestmark = pytest.mark.anyio
 
-LIMIT = 2 * 2**20
-
-
-async def _until(condition: Callable[[], object]) -> None:
-    """Wait until something is so; the test's own timeout bounds it."""
-    while not condition():
-        await asyncio.sleep(0.01)
-
 
 @pytest.fixture
 async def pair(free_port: int) -> AsyncIterator[tuple[Session, Session]]:
     """Two linked peers."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    limits = {"max_payload_bytes": LIMIT, "max_record_bytes": 2**20}
-    one = await Session.open(PlaneConfig(listen=(endpoint,), **limits), "f")
-    other = await Session.open(PlaneConfig(connect=(endpoint,), **limits), "f")
-    await _until(lambda: one.linked and other.linked)
-    yield one, other
-    await one.close()
-    await other.close()
-
-
-async def _heard(speaker: Session, listener: Session) -> None:
-    """Wait until the speaker's puts reach the listener's subscriptions."""
-    heard = asyncio.Event()
-    closer = listener.subscribe("swiftbot/f/probe", lambda _: heard.set())
-    while not heard.is_set():
-        speaker.put("swiftbot/f/probe", b"")
-        await asyncio.sleep(0.01)
-    closer.close()
+    async with linked_pair(free_port) as both:
+        yield both
 
 
 async def test_facts_arrive_in_order_on_the_loop(pair: tuple[Session, Session]) -> None:
@@ -66,11 +38,11 @@ async def test_facts_arrive_in_order_on_the_loop(pair: tuple[Session, Session]) 
     one, other = pair
     seen: list[Message] = []
     closer = other.subscribe("swiftbot/f/x/*", seen.append)
-    await _heard(one, other)
+    await heard(one, other)
     for n in range(500):
         one.put("swiftbot/f/x/a", str(n).encode(), encoding="text/plain")
     one.delete("swiftbot/f/x/a")
-    await _until(lambda: len(seen) == 501)
+    await until(lambda: len(seen) == 501)
     assert [message.payload for message in seen[:-1]] == [str(n).encode() for n in range(500)]
     assert seen[-1].deleted
     assert not seen[0].deleted
@@ -79,7 +51,7 @@ async def test_facts_arrive_in_order_on_the_loop(pair: tuple[Session, Session]) 
     closer.close()
     closer.close()
     one.put("swiftbot/f/x/a", b"late")
-    await _heard(one, other)
+    await heard(one, other)
     assert len(seen) == 501
 
 
@@ -88,7 +60,7 @@ async def test_bad_facts_are_counted_and_dropped(pair: tuple[Session, Session]) 
     one, other = pair
     seen: list[tuple[str, LogLine | None]] = []
     other.subscribe_typed(other.keys.log(), LogLine, lambda key, value: seen.append((key, value)))
-    await _heard(one, other)
+    await heard(one, other)
     good = encode(LogLine(at_ns=1, level="info", source="s", event="e"))
     key = one.keys.log("g")
     bad = [b"", b"{", b"\xff\xfe", b"[]", b'{"at_ns": "x"}', b"null", b"[" * 100_000]
@@ -96,7 +68,7 @@ async def test_bad_facts_are_counted_and_dropped(pair: tuple[Session, Session]) 
         one.put(key, payload)
     one._wire.raw.put(key, b"x" * (LIMIT + 1))  # a foreign client keeps to no limit
     one.delete(key)
-    await _until(lambda: len(seen) == 3)
+    await until(lambda: len(seen) == 3)
     assert [value is None for _, value in seen] == [False, False, True]
     assert other.refused == {"malformed gw/*/log": len(bad), "oversize gw/*/log": 1}
 
@@ -108,11 +80,11 @@ async def test_facts_that_nobody_wants_are_not_decoded(pair: tuple[Session, Sess
     other.subscribe_typed(
         other.keys.log(), LogLine, lambda key, _: seen.append(key), wanted=lambda key: key.endswith("/b/log")
     )
-    await _heard(one, other)
+    await heard(one, other)
     good = encode(LogLine(at_ns=1, level="info", source="s", event="e"))
     for gateway, payload in (("a", good), ("a", b"{"), ("b", good), ("a", good), ("b", good)):
         one.put(one.keys.log(gateway), payload)
-    await _until(lambda: len(seen) == 2)
+    await until(lambda: len(seen) == 2)
     assert {key.split("/")[-2] for key in seen} == {"b"}
     assert other.refused == {}
 
@@ -124,7 +96,7 @@ async def test_what_is_not_heeded_does_not_reach_the_loop(pair: tuple[Session, S
     other.subscribe_typed(
         other.keys.log(), LogLine, lambda key, _: seen.append(key), heed=lambda key: key.endswith("/b/log")
     )
-    await _heard(one, other)
+    await heard(one, other)
     posted = list[object]()
     post = other._wire.inbox.post
     other._wire.inbox.post = lambda *args, **more: posted.append(args) or post(*args, **more)  # type: ignore[method-assign]
@@ -133,7 +105,7 @@ async def test_what_is_not_heeded_does_not_reach_the_loop(pair: tuple[Session, S
         one.put(one.keys.log(gateway), payload, express=True)
     one._wire.raw.put(one.keys.log("a"), b"x" * (LIMIT + 1))
     one.put(one.keys.log("b"), good)
-    await _until(lambda: len(seen) == 3)
+    await until(lambda: len(seen) == 3)
     assert len(posted) == 3
     assert other.refused == {}
 
@@ -145,17 +117,17 @@ async def test_a_flood_is_bounded_and_counted(free_port: int) -> None:
     other = await Session.open(PlaneConfig(connect=(endpoint,)), "f")
     seen: list[Message] = []
     one.subscribe("swiftbot/f/x", seen.append)
-    await _heard(other, one)
+    await heard(other, one)
     for _ in range(5000):
         other.put("swiftbot/f/x", b"x" * 100)
     while other._wire.outbox._waiting:
         time.sleep(0.01)  # noqa: ASYNC251 - the loop must not turn: it is what is overrun here
     time.sleep(0.2)  # noqa: ASYNC251
     assert len(one._wire.inbox._waiting) == 100
-    await _until(lambda: one.refused.get("incoming queue full", 0) + len(seen) == 5000)
+    await until(lambda: one.refused.get("incoming queue full", 0) + len(seen) == 5000)
     seen.clear()
     other.put("swiftbot/f/x", b"after")
-    await _until(lambda: [message.payload for message in seen] == [b"after"])
+    await until(lambda: [message.payload for message in seen] == [b"after"])
     await one.close()
     await other.close()
 
@@ -169,99 +141,32 @@ async def test_an_oversize_put_is_refused_here(pair: tuple[Session, Session]) ->
         await one.query("swiftbot/f/x", b"x" * (LIMIT + 1), timeout_s=1)
 
 
-async def test_requests_and_their_errors(pair: tuple[Session, Session]) -> None:
-    """A verb answers; each error comes back as the class that was raised, a defect as `internal`."""
-    one, other = pair
-    caller, server = Rpc(one, "a"), Rpc(other, "b")
-
-    async def handle(need: Need) -> Need:
-        if need.image == "refuse":
-            raise RefusedError("no", remedy="later")
-        if need.image == "plan":
-            raise PlanError("none", problems=("p1", "p2"))
-        if need.image == "defect":
-            raise ZeroDivisionError("oh")
-        if need.image == "slow":
-            await asyncio.sleep(30)
-        return need
-
-    server.register("need", Need, handle)
-    while True:  # until the queryable is known over there
-        try:
-            assert await caller.call("b", "need", Need(image="x"), Need) == Need(image="x")
-            break
-        except UnreachableError:
-            await asyncio.sleep(0.01)
-    with pytest.raises(RefusedError, match=r"no \(later\)"):
-        await caller.call("b", "need", Need(image="refuse"), Need)
-    with pytest.raises(PlanError) as caught:
-        await caller.call("b", "need", Need(image="plan"), Need)
-    assert caught.value.problems == ("p1", "p2")
-    with pytest.raises(SwiftbotError, match="ZeroDivisionError: oh") as defect:
-        await caller.call("b", "need", Need(image="defect"), Need)
-    assert defect.value.code == "internal"
-    with pytest.raises(DeadlineError):
-        await caller.call("b", "need", Need(image="slow"), Need, timeout_s=0.1)
-    with pytest.raises(UnreachableError):
-        await caller.call("b", "nothing", Need(image="x"), Need)
-    with pytest.raises(PayloadError, match="no ErrorReply"):
-        await caller.call("b", "need", Need(image="x"), ErrorReply)
-    with pytest.raises(ConfigError):
-        server.register("need", Need, handle)
-
-
 @pytest.mark.parametrize("direct", [False, True])
 async def test_a_question_that_may_have_been_heard_is_told_from_one_that_went_nowhere(
     pair: tuple[Session, Session], direct: bool
 ) -> None:
     """Whoever was asked goes away before it answers: it may have done it. Nobody was there: nobody has."""
     one, other = pair
-    heard = asyncio.Event()
+    asked = asyncio.Event()
 
     async def never(key: str, payload: bytes) -> bytes:
-        heard.set()
+        asked.set()
         await asyncio.Event().wait()
         return payload
 
-    await _heard(one, other)  # a link that is only just there may have something asked over it all the same
+    await heard(one, other)  # a link that is only just there may have something asked over it all the same
     with pytest.raises(UnreachableError) as nobody:
         await one.query("swiftbot/f/q", b"x", timeout_s=60, direct=direct)
     assert not nobody.value.sent
     other.serve("swiftbot/f/q", never)
-    await _heard(one, other)
+    await heard(one, other)
     asking = asyncio.create_task(one.query("swiftbot/f/q", b"x", timeout_s=60, direct=direct))
-    await heard.wait()
+    await asked.wait()
     # As the death of its process does: nobody is told anything.
     await asyncio.to_thread(other._wire.raw.close)
     with pytest.raises(UnreachableError) as gone:
         await asking
     assert gone.value.sent
-
-
-async def test_bad_requests_are_answered_with_the_reason(pair: tuple[Session, Session]) -> None:
-    """Malformed and oversize requests get an ErrorReply of code `payload`, are counted, and reach no handler."""
-    one, other = pair
-    server = Rpc(other, "b")
-    reached: list[Need] = []
-
-    async def handle(need: Need) -> Need:
-        reached.append(need)
-        return need
-
-    server.register("need", Need, handle)
-    key = one.keys.rpc("b", "need")
-    await _heard(one, other)
-    bad = [b"", b"{", b"\xff", b"[]", b'{"image": 5}', b"[" * 100_000]
-    for payload in bad:
-        with pytest.raises(PayloadError, match="not a Need"):
-            await one.query(key, payload, timeout_s=5)
-    foreign = await asyncio.to_thread(lambda: list(one._wire.raw.get(key, payload=b"x" * (LIMIT + 1), timeout=5)))
-    assert len(foreign) == 1
-    assert foreign[0].err is not None
-    assert msgspec.json.decode(foreign[0].err.payload.to_bytes(), type=ErrorReply).code == "payload"
-    assert reached == []
-    assert other.refused == {"malformed gw/b/rpc/need": len(bad), "oversize gw/b/rpc/need": 1}
-    assert await one.query(key, b'{"image": "x"}', timeout_s=5) == b'{"image":"x"}'
 
 
 async def test_a_question_for_another_key_is_refused(pair: tuple[Session, Session]) -> None:
@@ -275,7 +180,7 @@ async def test_a_question_for_another_key_is_refused(pair: tuple[Session, Sessio
 
     key = other.keys.command("rover_2")
     other.serve(key, handle)
-    await _heard(one, other)
+    await heard(one, other)
     wrong = one.keys.command("rover_4").encode()
     foreign = await asyncio.to_thread(lambda: list(one._wire.raw.get(key, payload=b"x", attachment=wrong, timeout=5)))
     assert foreign[0].err is not None
@@ -291,41 +196,6 @@ async def test_a_question_for_another_key_is_refused(pair: tuple[Session, Sessio
     assert plain[0].ok is not None
 
 
-async def test_exchanges_can_be_watched(pair: tuple[Session, Session]) -> None:
-    """Each exchange is put: request and reply as JSON, what is too large by digest, errors by code."""
-    one, other = pair
-    seen: list[Exchange | None] = []
-    one.subscribe_typed(one.keys.exchange(), Exchange, lambda _, exchange: seen.append(exchange))
-    server = Rpc(other, "b")
-
-    async def handle(need: Need) -> Need:
-        return Need(image="y" * 40_000) if need.image == "large" else need
-
-    async def quiet(need: Need) -> Need:
-        return need
-
-    server.register("need", Need, handle)
-    server.register("quiet", Need, quiet, exchange=False)
-    await _heard(other, one)
-    await _heard(one, other)
-    caller = Rpc(one, "a")
-    await caller.call("b", "quiet", Need(image="x"), Need)
-    await caller.call("b", "need", Need(image="x"), Need)
-    await caller.call("b", "need", Need(image="large"), Need)
-    with pytest.raises(PayloadError):
-        await one.query(one.keys.rpc("b", "need"), b"\xff{", timeout_s=5)
-    await _until(lambda: len(seen) == 3)
-    small, large, malformed = (json.loads(encode(each)) for each in seen)
-    assert (small["verb"], small["gateway"], small["request"], small["reply"]) == (
-        "need", "b", {"image": "x"}, {"image": "x"},
-    )  # fmt: skip
-    assert small["duration_ms"] >= 0
-    assert large["reply"]["bytes"] > 40_000
-    assert len(large["reply"]["sha256"]) == 64
-    assert malformed["error"]["code"] == "payload"
-    assert isinstance(malformed["request"], str)
-
-
 async def test_too_many_queries_at_once_are_refused(free_port: int) -> None:
     """Beyond `concurrent_queries` a query is answered `refused` at once; the others are answered."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -338,9 +208,9 @@ async def test_too_many_queries_at_once_are_refused(free_port: int) -> None:
         return payload
 
     server.serve("swiftbot/f/q", handle)
-    await _heard(client, server)
+    await heard(client, server)
     asked = [asyncio.create_task(client.query("swiftbot/f/q", b"x", timeout_s=20)) for _ in range(5)]
-    await _until(lambda: sum(each.done() for each in asked) == 3)
+    await until(lambda: sum(each.done() for each in asked) == 3)
     go.set()
     results = await asyncio.gather(*asked, return_exceptions=True)
     assert sum(isinstance(each, RefusedError) for each in results) == 3
@@ -362,7 +232,7 @@ async def test_closing_ends_what_is_under_way(free_port: int) -> None:
         return b""
 
     server.serve("swiftbot/f/q", handle)
-    await _heard(client, server)
+    await heard(client, server)
     first = asyncio.create_task(client.query("swiftbot/f/q", b"", timeout_s=60))
     await begun.wait()
     await server.close()
@@ -391,7 +261,7 @@ async def test_everybody_is_asked(pair: tuple[Session, Session]) -> None:
     one.serve("swiftbot/f/all/one", good)
     other.serve("swiftbot/f/all/two", good)
     other.serve("swiftbot/f/all/three", bad)
-    await _heard(one, other)
+    await heard(one, other)
     answers = await one.query_all("swiftbot/f/all/*", b"hi", timeout_s=5)
     assert {(each.key, each.payload) for each in answers} == {
         ("swiftbot/f/all/one", b"hi!"), ("swiftbot/f/all/two", b"hi!"),
@@ -413,13 +283,13 @@ async def test_answers_to_everybody_are_bounded(free_port: int, monkeypatch: pyt
 
     handler = zenoh.handlers.Callback(many, indirect=False)
     queryable = other._wire.raw.declare_queryable("swiftbot/f/many/*", handler, complete=True)
-    await _heard(one, other)
+    await heard(one, other)
     few = await one.query_all("swiftbot/f/many/*", b"x", timeout_s=20)
     assert len({each.key for each in few}) == 20
-    await _until(lambda: one.refused == {"answers beyond the limit": 30})
+    await until(lambda: one.refused == {"answers beyond the limit": 30})
     heavy = await one.query_all("swiftbot/f/many/*", b"x" * 200_000, timeout_s=20)
     assert len(heavy) == 5
-    await _until(lambda: one.refused == {"answers beyond the limit": 75})
+    await until(lambda: one.refused == {"answers beyond the limit": 75})
     assert await one.query("swiftbot/f/many/0", b"", timeout_s=20) == b"0"
     assert one.refused == {"answers beyond the limit": 75}
     queryable.undeclare()
@@ -436,9 +306,9 @@ async def test_tokens_are_seen_by_those_who_come_later(pair: tuple[Session, Sess
     while await other.alive_now(other.keys.alive()) != [key]:
         await asyncio.sleep(0.01)
     other.watch_alive(other.keys.alive(), lambda each, alive: seen.append((each, alive)))
-    await _until(lambda: seen == [(key, True)])
+    await until(lambda: seen == [(key, True)])
     token.close()
-    await _until(lambda: seen == [(key, True), (key, False)])
+    await until(lambda: seen == [(key, True), (key, False)])
 
 
 async def test_a_token_lasts_though_nobody_holds_it(pair: tuple[Session, Session]) -> None:
@@ -448,7 +318,7 @@ async def test_a_token_lasts_though_nobody_holds_it(pair: tuple[Session, Session
     gc.collect()
     seen: list[bool] = []
     other.watch_alive(other.keys.alive(), lambda _, alive: seen.append(alive))
-    await _until(lambda: seen)
+    await until(lambda: seen)
     assert await other.alive_now(other.keys.alive()) == [one.keys.alive("a")]
     await one.close()
-    await _until(lambda: seen == [True, False])
+    await until(lambda: seen == [True, False])
