@@ -1,8 +1,8 @@
 """All verbs of a gateway behind one queryable, `gw/{gateway}/rpc/*`.
 
-A queryable for each would be some eighty of a gateway, and Zenoh tells every session of each and compares every key with
-all of them: with eight gateways on two cores one that was restarted showed its token 30 ms after its session was open, and
-19 ms with one queryable. The recorder and other clients of Zenoh see no difference: the keys are the same.
+A queryable for each would be some eighty of a gateway, and Zenoh tells every session of each and compares every key
+with all of them: with eight gateways on two cores one that was restarted showed its token 30 ms after its session was
+open, and 19 ms with one queryable. The recorder and other clients of Zenoh see no difference: the keys are the same.
 """
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # The library's stubs leave out the return types of methods that return nothing.
