@@ -324,6 +324,9 @@ class Dht:
         if self.owns(key) and not await self._until_settled(key):
             unsure = f"{self._gateway} owns it and has not compared its copies with the others' yet"
         record = await self._store.record(key)
+        if record is None and self.owns(key) and not self._met():
+            await self._until_met()
+            record = await self._store.record(key)
         if record is not None:
             return Found(record)
         if not self.owns(key):
@@ -438,6 +441,17 @@ class Dht:
                 log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
             return False
         return True
+
+    def _met(self) -> bool:
+        """Whether the shard has been compared with everybody who is there: who began apart may have what is not here."""
+        return self._membership.ring.members <= self._settled.members
+
+    async def _until_met(self) -> None:
+        """Wait a moment until it has: where members of a bounded view come and go, somebody always has just come."""
+        self.on_wanted()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_RETURNED_S), self._settling:
+                await self._settling.wait_for(self._met)
 
     async def close(self) -> None:
         """Give up what is still being pushed."""

@@ -157,7 +157,7 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
     """Every verb the plane serves answers `payload` to what is malformed, oversize or impossible, and goes on."""
     plane = fleet.planes[0]
     foreign = await Session.open(PlaneConfig(mode="client", connect=(fleet.endpoints[0],)), "f")
-    verbs = sorted(plane.rpc._verbs)
+    verbs = sorted(plane.rpc._registered)
     impossible = {
         "quorum_accept": [{"key": "", "ballot": [1, "a"], "record": {"key": ""}, "voters": ""}],
         "quorum_prepare": [{"key": "", "ballot": [1, "a"], "voters": ""}],
