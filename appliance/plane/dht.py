@@ -443,7 +443,7 @@ class Dht:
         return True
 
     def _met(self) -> bool:
-        """Whether the shard has been compared with everybody who is there: who began apart may have what is not here."""
+        """Whether the shard is compared with everybody who is there: who began apart may have what is not here."""
         return self._membership.ring.members <= self._settled.members
 
     async def _until_met(self) -> None:
