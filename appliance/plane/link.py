@@ -144,7 +144,12 @@ def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
         # Peers look for each other for ever in the background, so gateways may start in any order.
         "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
         "connect/exit_on_failure": client,
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        # A recorder misses what a restarted gateway says while it is not linked with it again: up after 0.3 s.
+        "connect/retry": {
+            "period_init_ms": 50,
+            "period_max_ms": 1000 if client else 200,
+            "period_increase_factor": 1.5,
+        },
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
         "scouting/delay": 0,
