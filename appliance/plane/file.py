@@ -18,7 +18,7 @@ log = structlog.get_logger(__name__)
 SCHEMA = 1
 _BUSY_S = 5.0
 
-_TABLES = """
+TABLES = """
 CREATE TABLE IF NOT EXISTS records (
     key TEXT PRIMARY KEY, value BLOB NOT NULL, version TEXT NOT NULL, deleted INTEGER NOT NULL,
     write TEXT NOT NULL, digest TEXT NOT NULL, updated_ns INTEGER NOT NULL);
@@ -80,7 +80,7 @@ class File:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = FULL")
             _check(db, self.path)
-            db.executescript(_TABLES)
+            db.executescript(TABLES)
             db.execute(f"PRAGMA user_version = {SCHEMA}")
         except BaseException:
             db.close()

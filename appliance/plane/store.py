@@ -22,7 +22,7 @@ from appliance.plane.ahead import NOTHING, Ahead, Mark
 from appliance.plane.file import File, problem_of
 from appliance.plane.picture import Picture
 from appliance.plane.room import Room
-from appliance.plane.rows import COLUMNS, from_row, prefixed, put_row, read_row
+from appliance.plane.rows import put_row, read_digests, read_kept, read_keys, read_records, read_row
 from appliance.plane.versions import Record, digest
 
 log = structlog.get_logger(__name__)
@@ -112,8 +112,7 @@ class Store:
 
     async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
         """Return (key, value) of every key with that prefix, in order."""
-        where, bounds = prefixed(prefix)
-        return await self._read(f"SELECT key, value FROM kept {where} ORDER BY key", *bounds)  # noqa: S608
+        return await self._call(partial(read_kept, prefix=prefix))
 
     # --- records ----------------------------------------------------------------------------------------------
 
@@ -135,13 +134,11 @@ class Store:
 
     async def records(self, prefix: str) -> list[Record]:
         """Return every record with that prefix, tombstones too, in order of keys."""
-        where, bounds = prefixed(prefix)
-        rows = await self._read(f"SELECT {COLUMNS} FROM records {where} ORDER BY key", *bounds)  # noqa: S608
-        return [from_row(row) for row in rows]
+        return await self._call(partial(read_records, prefix=prefix))
 
     async def digests(self) -> list[tuple[str, str]]:
         """Return (key, digest) of every record, in order of keys."""
-        return await self._read("SELECT key, digest FROM records ORDER BY key")
+        return await self._call(read_digests)
 
     async def change(
         self, key: str, decide: Callable[[Record | None], Record | None], *, durable: bool = True
@@ -311,7 +308,7 @@ class Store:
     def _run(self) -> None:
         try:
             db = self._file.connect()
-            self._picture = Picture(row[0] for row in db.execute("SELECT key FROM records"))
+            self._picture = Picture(read_keys(db))
         except Exception as error:  # noqa: BLE001 - supervision boundary: whatever went wrong must reach the caller of `open`
             self._post(self._opened, None, error)
             return
