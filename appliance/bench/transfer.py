@@ -56,7 +56,7 @@ async def run(
                 _other(Path(folder) / "there", fleet, ends, podman_url) as change,
             ):
                 async with asyncio.timeout(_READY_S):
-                    while len(plane.members()) < 2 or not plane.dht.reconciled():  # noqa: ASYNC110 - no event for it
+                    while len(plane.members()) < 2 or not plane.dht.settling.reconciled():  # noqa: ASYNC110 - no event for it
                         await asyncio.sleep(0.01)
                 for number in range(rounds):
                     progress(f"transfer: {megabytes} MB, round {number + 1} of {rounds}")

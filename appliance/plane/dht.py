@@ -24,9 +24,9 @@ from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, Sto
 from appliance.plane.pulse import Pulse
 from appliance.plane.pushing import Pushing
 from appliance.plane.quorum.voting import Voting
-from appliance.plane.ring import Ring
 from appliance.plane.rpc import AtOnce, Rpc
 from appliance.plane.settings import PlaneConfig
+from appliance.plane.settling import RETURNED_S, Settling
 from appliance.plane.store import Store
 from appliance.plane.versions import (
     Behind,
@@ -51,11 +51,6 @@ _AGAIN_S = 0.03
 """Between tries while the membership settles."""
 _APART_S = 1.0
 """How long a reader asks again when whom it takes for a key's owner is not there, or says that the key is another's."""
-_SETTLE_S = 2.0
-"""How long an owner lets requests wait for its reconciling; then it answers with what it has."""
-_RETURNED_S = 0.4
-"""How long of it a write waits for one that has come back and is not compared with yet: if it holds something newer, it
-says so when it is given the write. One that is silent must hold up no takeover for long, `reconcile.LOSS_S`."""
 _MOST_NAMED = 5
 """Gateways named in an error."""
 
@@ -84,15 +79,11 @@ class Dht:
         self._pulse = pulse
         self._voting = voting
         voting.resolver = lambda: self.resolver or by_bytes
-        self.on_wanted: Callable[[], None] = lambda: None
-        """Called when a request waits for the shard to be reconciled."""
-        self.returned: frozenset[str] = frozenset()
-        """Members that were away and have come back, with whom the shard is not compared yet: on the other side of a
-        cut they may have ordered writes."""
+        self.settling = Settling(
+            gateway=gateway, membership=membership, pulse=pulse, replicas=config.replicas,
+            virtual_nodes=config.virtual_nodes,
+        )  # fmt: skip
         self.absence = Absence(replicas=config.replicas, whole=config.view == "full")
-        self._stalls = 0
-        self._settled = Ring((), virtual_nodes=config.virtual_nodes)
-        self._settling = asyncio.Condition()
         self._pushing = Pushing(config, gateway=gateway, store=store, rpc=rpc, membership=membership, keep=self.keep)
         voting.learn = self._pushing.learn
         self._unsaved: set[str] = set()
@@ -242,7 +233,7 @@ class Dht:
         if not self.owns(asked.key):
             owner = self._membership.ring.owner(asked.key)
             raise RefusedError(f"{asked.key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
-        await self._until_settled(asked.key, returned_s=_RETURNED_S)
+        await self.settling.until_mine(asked.key, returned_s=RETURNED_S)
         if asked.key in self._unsaved:
             await self._catch_up(asked.key)
         try:
@@ -321,11 +312,11 @@ class Dht:
 
     async def _on_read(self, asked: KeyAsk) -> Found:
         key, unsure = check_key(asked.key), ""
-        if self.owns(key) and not await self._until_settled(key):
+        if self.owns(key) and not await self.settling.until_mine(key):
             unsure = f"{self._gateway} owns it and has not compared its copies with the others' yet"
         record = await self._store.record(key)
-        if record is None and self.owns(key) and not self._met():
-            await self._until_met()
+        if record is None and self.owns(key) and not self.settling.met():
+            await self.settling.until_met()
             record = await self._store.record(key)
         if record is not None:
             return Found(record)
@@ -345,9 +336,10 @@ class Dht:
 
         Whether there is none is for the event loop to say: it knows who was not heard.
         """
-        if self._config.view != "full" or (self._membership.owns(check_key(asked.key)) and not self._mine(asked.key)):
+        key = check_key(asked.key)
+        if self._config.view != "full" or (self._membership.owns(key) and not self.settling.mine(key)):
             return False
-        _, record = self._store.look(asked.key)
+        _, record = self._store.look(key)
         if record is not None:
             answer(Found(record))
         return record is not None
@@ -393,65 +385,6 @@ class Dht:
 
     def _replicas(self, key: str) -> tuple[str, ...]:
         return self._membership.ring.successors(key, self._config.replicas)
-
-    # --- settling ---------------------------------------------------------------------------------------------
-
-    def reconciled(self) -> bool:
-        """Whether the shard has been reconciled with the members of the ring as it is just now."""
-        return self._settled == self._membership.ring and self._stalls == self._pulse.stalls
-
-    async def settled(self, ring: Ring, stalls: int) -> None:
-        """The shard has been reconciled with the members of that ring, `stalls` so far: what waited for it goes on."""
-        self._settled, self._stalls = ring, stalls
-        async with self._settling:
-            self._settling.notify_all()
-
-    def _compared(self, key: str) -> bool:
-        """Whether a key was this gateway's when it last reconciled; from any thread."""
-        settled = self._settled
-        known = bool(settled.members) and self._stalls == self._pulse.stalls
-        return known and settled.owner(key) == self._gateway
-
-    def _mine(self, key: str) -> bool:
-        """The same, and nobody has come back since who may know more; from any thread."""
-        return self._compared(key) and (not self.returned or self.returned.isdisjoint(self._replicas(key)))
-
-    async def _until_settled(self, key: str, *, returned_s: float | None = None) -> bool:
-        """Wait until this gateway has reconciled as the key's owner, which it may have become just now.
-
-        Args:
-            key: of a record.
-            returned_s: how long of it for members that have come back and are not compared with yet; None: as long.
-
-        Returns:
-            Whether it has; False after `_SETTLE_S` at most: then it goes on with what it has.
-        """
-        if self._mine(key):
-            return True
-        self.on_wanted()
-        loop = asyncio.get_running_loop()
-        until = loop.time() + (_SETTLE_S if returned_s is None else returned_s)
-        try:
-            async with asyncio.timeout(_SETTLE_S), self._settling:
-                await self._settling.wait_for(partial(self._compared, key))
-                async with asyncio.timeout_at(until):
-                    await self._settling.wait_for(partial(self._mine, key))
-        except TimeoutError:
-            if returned_s is None or not self._compared(key):
-                log.warning("answering before the shard is reconciled", key=key, waited_s=_SETTLE_S)
-            return False
-        return True
-
-    def _met(self) -> bool:
-        """Whether the shard is compared with everybody who is there: who began apart may have what is not here."""
-        return self._membership.ring.members <= self._settled.members
-
-    async def _until_met(self) -> None:
-        """Wait a moment until it has: where members of a bounded view come and go, somebody always has just come."""
-        self.on_wanted()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_RETURNED_S), self._settling:
-                await self._settling.wait_for(self._met)
 
     async def close(self) -> None:
         """Give up what is still being pushed."""

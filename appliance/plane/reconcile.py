@@ -85,7 +85,7 @@ class Reconciler:
         self._running: asyncio.Task[None] | None = None
         self._wanted = asyncio.Event()
         """A request waits for the shard to be reconciled."""
-        dht.on_wanted = self._wanted.set
+        dht.settling.on_wanted = self._wanted.set
         membership.on_joined.append(self._on_joined)
         membership.on_lost.append(self._on_lost)
         pulse.on_stalled.append(self._on_stalled)
@@ -97,11 +97,11 @@ class Reconciler:
 
     def _on_joined(self, name: str) -> None:
         if self._steps.met(name):
-            self._dht.returned |= {name}
+            self._dht.settling.returned |= {name}
         self._changed.set()
 
     def _on_lost(self, name: str) -> None:
-        self._dht.returned -= {name}
+        self._dht.settling.returned -= {name}
         now = time.monotonic()
         if self._config.view == "full":
             # A bounded view drops members that are there, and need not see whoever asks.
@@ -134,7 +134,7 @@ class Reconciler:
                     await self._changed.wait()
             self._changed.clear()
             self._hurry.clear()
-            if not self._dht.returned:
+            if not self._dht.settling.returned:
                 self._wanted.clear()
             step = self._steps.next(settled, self._membership.ring, self._pulse.stalls)
             if step.kind is Kind.ARRIVAL and not waited:
@@ -229,9 +229,9 @@ class Reconciler:
 
     async def _settle(self, step: Step, done: _Done) -> Settled:
         settled = self._steps.settled(step)
-        self._dht.returned -= step.ring.members
+        self._dht.settling.returned -= step.ring.members
         self._dht.absence.settled(step.ring)
-        await self._dht.settled(step.ring, step.stalls)
+        await self._dht.settling.settled(step.ring, step.stalls)
         fields: dict[str, Any] = {}
         if step.kind is Kind.LOSS and self._lost_at is not None:
             fields["after_loss_ms"] = round((time.monotonic() - self._lost_at) * 1e3, 1)

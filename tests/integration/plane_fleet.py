@@ -45,7 +45,8 @@ class Fleet:
         """Wait until every gateway sees every other and has reconciled with them."""
         await until(
             lambda: all(
-                len(plane.members()) == len(self.planes) and plane.dht.reconciled() for plane in self.planes.values()
+                len(plane.members()) == len(self.planes) and plane.dht.settling.reconciled()
+                for plane in self.planes.values()
             )
         )
 

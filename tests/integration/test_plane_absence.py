@@ -56,7 +56,7 @@ async def planes(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncI
 
 async def settled(planes: list[Plane]) -> None:
     """Wait until each sees all the others and has reconciled with them."""
-    await until(lambda: all(len(each.members()) == len(planes) and each.dht.reconciled() for each in planes))
+    await until(lambda: all(len(each.members()) == len(planes) and each.dht.settling.reconciled() for each in planes))
 
 
 async def only_at(plane: Plane, key: str) -> None:
@@ -161,7 +161,7 @@ async def test_an_owner_that_has_not_compared_its_copies_says_so(
     owner = planes[1]
     missing, there = key_of(owner, "g1", "g2", "g3"), key_of(owner, "g1", "g3", "g2")
     await planes[0].dht.write(there, b"v", expected=None)
-    monkeypatch.setattr(owner.dht, "_settled", Ring((), virtual_nodes=owner.config.virtual_nodes))
+    monkeypatch.setattr(owner.dht.settling, "_ring", Ring((), virtual_nodes=owner.config.virtual_nodes))
     for plane in planes:
         with pytest.raises(UnreachableError, match="not compared"):
             await plane.dht.read(missing)
@@ -199,7 +199,7 @@ async def test_a_silent_member_holds_up_no_takeover_and_may_have_what_is_missing
     news = asyncio.Event()
     await lost.close()
     planes.remove(lost)
-    await until(lambda: "g2" not in successor.members() and successor.dht.reconciled())
+    await until(lambda: "g2" not in successor.members() and successor.dht.settling.reconciled())
     losses = [members for members, within_s in asked if within_s is not None]
     assert len(losses) == 1
     assert "g1" in losses[0]
@@ -232,7 +232,7 @@ async def test_records_of_many_that_are_lost_at_once_are_not_said_to_be_gone(pla
     assert await here.store.record(there) is None
     for name in sorted(away):
         here._membership._seen(here.keys.alive(name), alive=False)
-    await until(here.dht.reconciled)
+    await until(here.dht.settling.reconciled)
     for key in (there, missing):
         with pytest.raises(UnreachableError, match="may have it"):
             await here.dht.read(key)
@@ -260,7 +260,7 @@ async def test_a_silent_member_that_has_come_back_holds_up_no_write(
     versions = {key: await owner.dht.write(key, b"before", expected=None) for key in (same, newer)}
     membership, token = owner._membership, owner.keys.alive("g1")
     membership._seen(token, alive=False)
-    await until(owner.dht.reconciled)
+    await until(owner.dht.settling.reconciled)
 
     async def never(*_: Any, **__: Any) -> Any:
         await asyncio.Event().wait()
@@ -271,7 +271,7 @@ async def test_a_silent_member_that_has_come_back_holds_up_no_write(
     meanwhile = Record(key=newer, value=b"meanwhile", version={**versions[newer], "g1": 1}, write="w")
     await back.dht.keep(meanwhile)
     membership._seen(token, alive=True)
-    assert owner.dht.returned == {"g1"}
+    assert owner.dht.settling.returned == {"g1"}
     monkeypatch.setattr(dht, "_SETTLE_S", 3600.0)  # nothing but the shorter wait lets a write through
     await owner.dht.write(same, b"after", expected=versions[same])
     with pytest.raises(ConflictError):

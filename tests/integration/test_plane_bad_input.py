@@ -40,7 +40,7 @@ async def _planes(folder: Path, ports: list[int], *fleets: str) -> AsyncIterator
                 config = PlaneConfig(listen=(ends[own],), connect=tuple(end for end in ends if end != ends[own]))
                 data = folder / f"{fleet}-{number}"
                 planes.append(await Plane.open(config, fleet=fleet, gateway=f"g{number}", data_dir=data))
-        await _until(lambda: all(len(each.members()) == 2 and each.dht.reconciled() for each in planes))
+        await _until(lambda: all(len(each.members()) == 2 and each.dht.settling.reconciled() for each in planes))
         yield planes
     finally:
         for plane in planes:

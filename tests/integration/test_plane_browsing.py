@@ -32,7 +32,7 @@ async def _fleet(folder: Path, ports: list[int]) -> AsyncIterator[list[Plane]]:
             config = PlaneConfig(listen=(endpoint,), connect=others, voters=names)
             planes.append(await Plane.open(config, fleet="browse", gateway=name, data_dir=folder / name))
             stack.push_async_callback(planes[-1].close)
-        while not all(len(each.members()) == len(planes) and each.dht.reconciled() for each in planes):
+        while not all(len(each.members()) == len(planes) and each.dht.settling.reconciled() for each in planes):
             await asyncio.sleep(0.02)
         yield planes
 

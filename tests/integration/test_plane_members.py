@@ -37,7 +37,7 @@ async def test_the_rest_of_a_start_waits_until_the_shard_is_compared(fleet: Flee
     plane = await fleet.start(1)
     assert not await plane.until_back(0.0)
     assert await plane.until_back(60.0)
-    assert plane.dht.reconciled()
+    assert plane.dht.settling.reconciled()
     assert plane.milestones["reconciled"] >= plane.milestones["joined"]
     found = await plane.dht.read(key)
     assert found is not None
@@ -183,7 +183,7 @@ async def test_a_request_waits_until_whoever_has_come_back_was_compared_with(
     version = await one.dht.write(key, b"before", expected=None)
     membership, comparing, token = one._membership, one._reconciler._comparing, one.keys.alive("g1")
     membership._seen(token, alive=False)
-    while not one.dht.reconciled():
+    while not one.dht.settling.reconciled():
         await asyncio.sleep(0.01)
     held, compare = asyncio.Event(), comparing.compare
 
@@ -202,7 +202,7 @@ async def test_a_request_waits_until_whoever_has_come_back_was_compared_with(
     record = await reading
     assert record is not None
     assert record.value == b"meanwhile"
-    assert not one.dht.returned
+    assert not one.dht.settling.returned
 
 
 async def test_an_id_that_is_taken_is_refused(fleet: Fleet) -> None:
@@ -241,7 +241,7 @@ async def test_gateways_that_lost_each_others_tokens_meet_again(fleet: Fleet) ->
     first, third = fleet.planes[1], fleet.planes[2]
     third._membership._seen(first.keys.alive("g1"), alive=False)
     first._membership._seen(first.keys.alive("g2"), alive=False)
-    await until(lambda: first.dht.reconciled() and third.dht.reconciled())
+    await until(lambda: first.dht.settling.reconciled() and third.dht.settling.reconciled())
     assert first.members() == {"g0", "g1"}
     first._reconciler._changed.set()
     await fleet.settled()
@@ -261,7 +261,7 @@ async def test_a_gateway_that_stood_still_orders_nothing_until_it_knows(fleet: F
     plane.dht.on_ring_change.append(told.set)
     pulse._last -= plane.config.lease_ms / 1e3
     assert await plane.dht.read(key) == missed
-    assert plane.dht.reconciled()
+    assert plane.dht.settling.reconciled()
     await told.wait()
     pulse._until = float("inf")
     stale = Write(key=key, value=b"stale", expected=version, write="stale")

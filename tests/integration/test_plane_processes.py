@@ -36,7 +36,7 @@ async def main():
                 record = await plane.dht.read(ask["key"])
                 answer = None if record is None else [record.value.decode(), record.version]
             elif ask["do"] == "state":
-                answer = [sorted(plane.members()), plane.dht.reconciled(), plane.ring.owner(ask["key"])]
+                answer = [sorted(plane.members()), plane.dht.settling.reconciled(), plane.ring.owner(ask["key"])]
         except SwiftbotError as error:
             answer = {"error": error.code}
         print(json.dumps(answer), flush=True)

@@ -41,7 +41,7 @@ class Fleet:
         plane = await Plane.open(config, fleet="quorum", gateway=f"g{number}", data_dir=self.folder / f"g{number}")
         self.planes[number] = plane
         while not all(
-            len(each.members()) == len(self.planes) and each.dht.reconciled() for each in self.planes.values()
+            len(each.members()) == len(self.planes) and each.dht.settling.reconciled() for each in self.planes.values()
         ):
             await asyncio.sleep(0.01)
         return plane

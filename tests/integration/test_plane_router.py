@@ -56,7 +56,7 @@ async def _gateway(folder: Path, name: str, *connect: str) -> AsyncIterator[Plan
 
 
 async def _together(*planes: Plane) -> None:
-    await _until(lambda: all(len(each.members()) == len(planes) and each.dht.reconciled() for each in planes))
+    await _until(lambda: all(len(each.members()) == len(planes) and each.dht.settling.reconciled() for each in planes))
 
 
 async def test_clients_of_a_router_form_a_ring(tmp_path: Path, free_port: int) -> None:

@@ -264,7 +264,7 @@ async def main():
     # What is asked for first is believed to fit: the disk itself must say that it does not.
     Spool.make_room = lambda self, size: None
     async with asyncio.timeout(60):
-        while len(side.plane.members()) < 2 or not side.plane.dht.reconciled():
+        while len(side.plane.members()) < 2 or not side.plane.dht.settling.reconciled():
             await asyncio.sleep(0.01)
     try:
         await side.transfers.bring_volume("maps")

@@ -78,7 +78,7 @@ class Sides:
         """Wait until every gateway sees every other and has reconciled with them."""
         async with asyncio.timeout(30):
             while not all(
-                len(side.plane.members()) == (members or len(self.there)) and side.plane.dht.reconciled()
+                len(side.plane.members()) == (members or len(self.there)) and side.plane.dht.settling.reconciled()
                 for side in self.there.values()
             ):
                 await asyncio.sleep(0.01)

@@ -207,7 +207,7 @@ async def _planes(nodes: int, folder: Path) -> AsyncGenerator[list[Plane]]:
             planes.append(await Plane.open(config, fleet=fleet, gateway=f"g{number}", data_dir=data))
         async with asyncio.timeout(_LINE_S):
             while not all(  # noqa: ASYNC110 - no single event says so of all
-                len(each.members()) == nodes and each.dht.reconciled() for each in planes
+                len(each.members()) == nodes and each.dht.settling.reconciled() for each in planes
             ):
                 await asyncio.sleep(0.05)
         yield planes

@@ -59,7 +59,7 @@ async def serve(options: NodeOptions) -> None:
     config = PlaneConfig(listen=(options.listen,), connect=options.connect)
     plane = await Plane.open(config, fleet=options.fleet, gateway=options.gateway, data_dir=Path(options.folder))
     try:
-        while len(plane.members()) < options.members or not plane.dht.reconciled():  # noqa: ASYNC110 - no single event says so
+        while len(plane.members()) < options.members or not plane.dht.settling.reconciled():  # noqa: ASYNC110 - no single event says so
             await asyncio.sleep(_LOOK_S)
         tell({"event": "ready"})
         while line := await reader.readline():

@@ -147,7 +147,7 @@ class Host:
             for name, plane in self._planes.items():
                 members = plane.members()
                 known = wanted[name] <= members <= plane.registry.gateways.keys()
-                if known and plane.dht.reconciled():
+                if known and plane.dht.settling.reconciled():
                     since.setdefault(name, now)
                     last[name] = now
                 elif now - last.get(name, -math.inf) > behind_s:
