@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from appliance.errors import ConflictError, DeadlineError, PrerequisiteError, UnreachableError
-from appliance.plane import dht, reconcile
+from appliance.plane import dht, reconcile, settling
 from appliance.plane.messages import Found, KeyAsk, RecordAsk
 from appliance.plane.node import Plane
 from appliance.plane.ring import Ring
@@ -157,7 +157,7 @@ async def test_an_owner_that_has_not_compared_its_copies_says_so(
     planes: list[Plane], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It waits for the comparison; when that takes too long it gives what it has, but does not say there is nothing."""
-    monkeypatch.setattr(dht, "_SETTLE_S", 0.05)
+    monkeypatch.setattr(settling, "SETTLE_S", 0.05)
     owner = planes[1]
     missing, there = key_of(owner, "g1", "g2", "g3"), key_of(owner, "g1", "g3", "g2")
     await planes[0].dht.write(there, b"v", expected=None)
@@ -272,12 +272,12 @@ async def test_a_silent_member_that_has_come_back_holds_up_no_write(
     await back.dht.keep(meanwhile)
     membership._seen(token, alive=True)
     assert owner.dht.settling.returned == {"g1"}
-    monkeypatch.setattr(dht, "_SETTLE_S", 3600.0)  # nothing but the shorter wait lets a write through
+    monkeypatch.setattr(settling, "SETTLE_S", 3600.0)  # nothing but the shorter wait lets a write through
     await owner.dht.write(same, b"after", expected=versions[same])
     with pytest.raises(ConflictError):
         await owner.dht.write(newer, b"after", expected=versions[newer])
     assert await owner.store.record(newer) == await back.store.record(newer)
-    monkeypatch.setattr(dht, "_SETTLE_S", 0.05)
+    monkeypatch.setattr(settling, "SETTLE_S", 0.05)
     with pytest.raises(UnreachableError, match="not compared"):
         await owner.dht.read(missing)
     assert (await owner.dht.read(same) or meanwhile).value == b"after"

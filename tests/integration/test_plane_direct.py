@@ -3,12 +3,14 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from types import SimpleNamespace
 
 import msgspec
 import pytest
 import zenoh
+from plane_fleet import until
+from plane_pair import heard, linked_pair
 
 from appliance.errors import DeadlineError, PlanError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import ErrorReply
@@ -22,22 +24,11 @@ KEY = "swiftbot/f/gw/b/rpc/ask"
 DOOR = f"{KEY}/@direct"
 
 
-async def _until(condition: Callable[[], object]) -> None:
-    """Wait until something is so; the test's own timeout bounds it."""
-    while not condition():
-        await asyncio.sleep(0.01)
-
-
 @pytest.fixture
 async def pair(free_port: int) -> AsyncIterator[tuple[Session, Session]]:
     """Two linked peers."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    one = await Session.open(PlaneConfig(listen=(endpoint,)), "f")
-    other = await Session.open(PlaneConfig(connect=(endpoint,)), "f")
-    await _until(lambda: one.linked and other.linked)
-    yield one, other
-    await one.close()
-    await other.close()
+    async with linked_pair(free_port) as sessions:
+        yield sessions
 
 
 class _Door:
@@ -66,16 +57,6 @@ class _Door:
         return dict(self.came)[payload]
 
 
-async def _heard(speaker: Session, listener: Session) -> None:
-    """Wait until the speaker knows what the listener listens to."""
-    heard = asyncio.Event()
-    closer = listener.subscribe("swiftbot/f/probe", lambda _: heard.set())
-    while not heard.is_set():
-        speaker.put("swiftbot/f/probe", b"")
-        await asyncio.sleep(0.01)
-    closer.close()
-
-
 async def _echo(key: str, payload: bytes) -> bytes:
     return payload
 
@@ -101,7 +82,7 @@ async def test_a_direct_question_is_a_message(pair: tuple[Session, Session]) -> 
     await door.heard(b"last")
     assert not {large, b"y"} & dict(door.came).keys()
     one.put("swiftbot/f/after", b"")
-    await _until(lambda: everything.count("swiftbot/f/after") == 2)
+    await until(lambda: everything.count("swiftbot/f/after") == 2)
     assert not [key for key in everything if "@" in key]
     assert not one._asking._direct._waiting
 
@@ -149,15 +130,15 @@ async def test_what_a_query_tells_a_message_tells(pair: tuple[Session, Session])
 async def test_whoever_goes_ends_what_waits_for_it(pair: tuple[Session, Session]) -> None:
     """Nobody there: nobody has heard it. Gone before the answer: it may have been done."""
     one, other = pair
-    heard = asyncio.Event()
+    asked = asyncio.Event()
 
     async def handle(key: str, payload: bytes) -> bytes:
         if payload == b"never":
-            heard.set()
+            asked.set()
             await asyncio.Event().wait()
         return payload
 
-    await _heard(one, other)  # a link that is only just there may have something asked over it all the same
+    await heard(one, other)  # a link that is only just there may have something asked over it all the same
     with pytest.raises(UnreachableError) as nobody:
         await one.query(KEY, b"x", timeout_s=60, direct=True)
     assert not nobody.value.sent
@@ -165,7 +146,7 @@ async def test_whoever_goes_ends_what_waits_for_it(pair: tuple[Session, Session]
     door = _Door(other)
     await door.known(one)
     asking = asyncio.create_task(one.query(KEY, b"never", timeout_s=60, direct=True))
-    await heard.wait()
+    await asked.wait()
     await door.heard(b"never")
     # As the death of its process does: nobody is told anything.
     await asyncio.to_thread(other._wire.raw.close)
@@ -202,7 +183,7 @@ async def test_whoever_is_known_to_listen_is_looked_for_again_in_doubt(pair: tup
     assert way._listened
     closer.close()
     door._subscriber.undeclare()
-    await _until(lambda: not way.open)
+    await until(lambda: not way.open)
     assert not way._listened
     way._listened = True
     with pytest.raises(DeadlineError):
@@ -285,9 +266,9 @@ async def test_bad_messages_reach_no_handler(pair: tuple[Session, Session]) -> N
         b"9" * 40 + b" abc k",
     ):  # fmt: skip
         raw.put(DOOR, b"x", attachment=attached)
-    await _until(lambda: other.refused.get("malformed gw/b/rpc/ask/@direct") == 11)
+    await until(lambda: other.refused.get("malformed gw/b/rpc/ask/@direct") == 11)
     raw.put(DOOR, b"x" * (link.MOST_DIRECT + 1), attachment=f"7 abc {KEY}".encode())
-    await _until(lambda: answers)
+    await until(lambda: answers)
     assert msgspec.json.decode(answers[0], type=ErrorReply).code == "payload"
     assert other.refused["oversize gw/b/rpc/ask"] == 1
     assert reached == []
@@ -320,18 +301,18 @@ async def test_ways_are_bounded(pair: tuple[Session, Session], monkeypatch: pyte
     """Of more doors than are kept the oldest is forgotten; a question that waits there ends, and new ones go on."""
     one, other = pair
     monkeypatch.setattr(direct, "_MOST_WAYS", 2)
-    heard = asyncio.Event()
+    asked = asyncio.Event()
 
     async def handle(key: str, payload: bytes) -> bytes:
         if payload == b"never":
-            heard.set()
+            asked.set()
             await asyncio.Event().wait()
         return payload
 
     other.serve(KEY, handle, direct=True)
     await _Door(other).known(one)
     asking = asyncio.create_task(one.query(KEY, b"never", timeout_s=60, direct=True))
-    await heard.wait()
+    await asked.wait()
     for number in range(3):
         with pytest.raises(UnreachableError):
             await one.query(f"swiftbot/f/gw/{number}/rpc/ask", b"x", timeout_s=60, direct=True)

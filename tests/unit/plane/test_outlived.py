@@ -8,7 +8,6 @@ from unittest.mock import MagicMock
 import pytest
 
 from appliance.plane.comparing import ASK_S, SEE_S
-from appliance.plane.dht import _RETURNED_S
 from appliance.plane.keys import Keys
 from appliance.plane.membership import Membership
 from appliance.plane.node import Plane
@@ -16,6 +15,7 @@ from appliance.plane.outlived import MOST_ASKED, REST_S, Outlived
 from appliance.plane.pulse import Pulse, Standstill
 from appliance.plane.reconcile import LOSS_S
 from appliance.plane.settings import PlaneConfig
+from appliance.plane.settling import RETURNED_S
 
 pytestmark = pytest.mark.anyio
 LEASE_S = 1.0
@@ -241,4 +241,4 @@ def test_whoever_is_not_seen_hears_so_before_its_question_ends() -> None:
 def test_a_silent_member_leaves_a_takeover_its_second() -> None:
     """Who takes over waits for it twice: when it compares its copies, and when it writes that it has taken over."""
     assert LOSS_S + PlaneConfig().replica_timeout_s < 1.0
-    assert _RETURNED_S + PlaneConfig().replica_timeout_s < 1.0
+    assert RETURNED_S + PlaneConfig().replica_timeout_s < 1.0

@@ -35,7 +35,7 @@ class Bench:
         self.on_ring_change: list[Callable[[], None]] = []
         config = PlaneConfig(view=view)
         self.absence = Absence(replicas=config.replicas, whole=view == "full")
-        self.returned: frozenset[str] = frozenset()
+        self.settling = SimpleNamespace(returned=frozenset(), settled=self.settled)
         self.membership = SimpleNamespace(members=RING.members, ring=RING, on_joined=[], on_lost=[])
         self.reconciler = Reconciler(
             config,
