@@ -114,6 +114,11 @@ async def side(name: str, *command: str, ready: bool = True) -> AsyncGenerator[S
         if ready:
             await it.hear("ready")
         yield it
+    except BaseException:
+        # Cancelled or failed: it has nothing to finish, and one after the other would take a minute.
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        raise
     finally:
         if process.returncode is None:
             if process.stdin is not None:
