@@ -86,6 +86,32 @@ async def test_clients_of_a_router_form_a_ring(tmp_path: Path, free_port: int) -
         assert heard.text == "g2 heard it"
 
 
+async def test_verbs_behind_a_router(tmp_path: Path, free_port: int) -> None:
+    """A verb of all gateways is answered by each under its own key, one that nobody serves by nobody."""
+    at = f"tcp/127.0.0.1:{free_port}"
+    async with _router(at), _gateway(tmp_path, "g1", at) as one, _gateway(tmp_path, "g2", at) as two:
+        await _together(one, two)
+
+        async def echo(word: Word) -> Word:
+            return word
+
+        for plane in (one, two):
+            plane.rpc.register("echo", Word, echo)
+        asked = b'{"text":"it"}'
+        answers: list[tuple[str, bytes]] = []
+        while len(answers) < 2:  # the router has yet to tell of both
+            messages = await one.session.query_all("swiftbot/f/gw/*/rpc/echo", asked, timeout_s=5)
+            answers = sorted((each.key, each.payload) for each in messages)
+        assert answers == [(f"swiftbot/f/gw/{name}/rpc/echo", asked) for name in ("g1", "g2")]
+        with pytest.raises(UnreachableError):
+            await one.rpc.call("g2", "nothing", Word("it"), Word)
+        two.rpc.close()
+        while len(await one.session.query_all("swiftbot/f/gw/*/rpc/echo", asked, timeout_s=5)) > 1:
+            await asyncio.sleep(0.02)
+        with pytest.raises(UnreachableError):
+            await one.rpc.call("g2", "echo", Word("it"), Word)
+
+
 async def test_a_gateway_behind_a_router_is_missed(tmp_path: Path, free_port: int) -> None:
     """When one of two clients leaves, the other sees it go and serves all records alone."""
     at = f"tcp/127.0.0.1:{free_port}"

@@ -138,7 +138,7 @@ class Host:
         better members for those it has, for minutes after the last has come: where `behind_s` is given a member may be
         so long behind with the facts and records of those it has just met.
         """
-        behind_s = float(ask["behind_s"])
+        behind_s, until = float(ask["behind_s"]), time.monotonic() + float(ask["within_s"])
         wanted = _wanted(ask["names"], self._planes, ask.get("after", 0), ask.get("before", 0))
         since: dict[str, float] = {}
         last: dict[str, float] = {}
@@ -154,6 +154,9 @@ class Host:
                     since.pop(name, None)
             if len(since) == len(self._planes):
                 return since
+            if now > until:
+                behind = [_lacking(plane, wanted[name]) for name, plane in self._planes.items() if name not in since]
+                raise SwiftbotError(f"{len(behind)} of {len(self._planes)} are not settled: {'; '.join(behind[:5])}")
             await asyncio.sleep(_LOOK_S)
 
     async def _until_came(self, ask: dict[str, Any]) -> dict[str, Any]:
@@ -235,6 +238,17 @@ class Host:
             task.cancel()
         await asyncio.gather(*self._publishing, return_exceptions=True)
         await asyncio.gather(*(plane.close() for plane in self._planes.values()))
+
+
+def _lacking(plane: Plane, wanted: frozenset[str]) -> str:
+    """What a member that is not settled has not got yet."""
+    members = plane.members()
+    unknown, untold = sorted(wanted - members), sorted(members - plane.registry.gateways.keys())
+    compared = "its shard is compared" if plane.dht.settling.reconciled() else "its shard is not compared"
+    return (
+        f"{plane.gateway} does not see {len(unknown)} ({', '.join(unknown[:5])}), has no facts of {len(untold)} "
+        f"({', '.join(untold[:5])}), {compared}"
+    )
 
 
 def _wanted(names: Sequence[str], here: Collection[str], after: int, before: int) -> dict[str, frozenset[str]]:

@@ -32,6 +32,8 @@ from appliance.ports import free_port
 Progress = Callable[[str], None]
 PATIENCE_S = 300.0
 """For one step of all members: opening them takes longest."""
+SETTLE_S = 240.0
+"""For all to know each other: less, so that whoever is late can say what it lacks."""
 END_S = 10.0
 _BEHIND_S = 2.0
 """How long a member with a bounded view may be behind with what those tell whom it has just met."""
@@ -207,9 +209,10 @@ class Fleet:
             # What lookups and copies rest on: who stands next to it, one more than hold its records before it.
             size = len(self._names)
             after, before = math.ceil(math.log2(max(2, size))), PlaneConfig().replicas + 1
-            await self._all("settled", names=self._names, after=after, before=before, behind_s=_BEHIND_S)
+            near = {"after": after, "before": before, "behind_s": _BEHIND_S}
         else:
-            await self._all("settled", names=self._names, behind_s=0.0)
+            near = {"behind_s": 0.0}
+        await self._all("settled", names=self._names, within_s=SETTLE_S, **near)
         result["open_s"], result["all_know_all_s"] = round(opened - began, 2), round(time.monotonic() - began, 2)
         self._progress(f"all know all after {result['all_know_all_s']} s; idle for {options.idle_s:g} s")
         result |= await self._idle(empty_mb)
