@@ -38,6 +38,8 @@ from appliance.plane.versions import (
     check_record,
     check_write,
     decide,
+    descends,
+    follows_here,
     settle,
 )
 
@@ -282,6 +284,8 @@ class Dht:
             for each in pushes:
                 each.end()
         newer = [answer for answer in answers if answer is not None]
+        if newer:
+            newer = await self._not_from_here(newer, record)
         if not newer:
             return record.version
         # A replica held a version that this owner had not seen: both now hold what `settle` made of the two.
@@ -291,6 +295,27 @@ class Dht:
             raise ConflictError(f"{record.key} was written elsewhere too", remedy="read it and decide again")
         await asyncio.gather(*(self._pushing.push(each, record) for each in others))
         return record.version
+
+    async def _not_from_here(self, newer: list[Record], record: Record) -> list[Record]:
+        """Those of what replicas hold in place of a record that this gateway has not itself decided upon it since.
+
+        A later decision may overtake it on the way, one as a query, the other as a plain message: then this write is in
+        what the replica holds, and done. A writer that was told of a conflict would do it a second time.
+        """
+        known: list[Record | None] = []
+
+        def look(current: Record | None) -> None:
+            known.append(current)
+
+        await self._store.change(record.key, look)  # after every decision that was made by now
+        current = known[-1]
+        if current is None:
+            return newer
+        return [
+            each
+            for each in newer
+            if not (descends(current.version, each.version) and follows_here(each, record, self._gateway))
+        ]
 
     async def _catch_up(self, key: str) -> None:
         """Ask every other replica for its version: the writer has seen one newer than ours."""

@@ -59,6 +59,15 @@ def increment(version: VersionVector, gateway: str) -> VersionVector:
     return version | {gateway: version.get(gateway, 0) + 1}
 
 
+def follows_here(later: Record, record: Record, gateway: str) -> bool:
+    """Whether `later` was decided by `gateway` upon `record`, and upon nothing that anybody else ordered meanwhile.
+
+    Then their versions differ in that gateway's own count alone: what `settle` makes of two counts for both.
+    """
+    counts = later.version.get(gateway, 0), record.version.get(gateway, 0)
+    return counts[0] > counts[1] and later.version == {**record.version, gateway: counts[0]}
+
+
 def by_bytes(key: str, one: Record, other: Record) -> Record:  # noqa: ARG001 - a resolver's signature
     """The default resolver: a total order on content, a removal above any value."""
     return max(one, other, key=lambda record: (record.deleted, record.value, record.write))

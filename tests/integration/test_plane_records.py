@@ -53,6 +53,41 @@ async def test_a_record_is_written_once_and_read_anywhere(fleet: Fleet) -> None:
     assert await one.dht.read("task/none") is None
 
 
+async def test_a_write_that_a_later_one_overtakes_is_done(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its replicas hold the later one when they are given it: the writer hears that it is done, and no conflict."""
+    owner, key, gate = fleet.planes[1], fleet.owned_by(1), asyncio.Event()
+    begin = owner.dht._pushing.begin
+
+    class Late:
+        """A push that waits."""
+
+        def __init__(self, gateway: str, record: Record) -> None:
+            self.gateway, self.record = gateway, record
+
+        async def done(self) -> Record | None:
+            """What came of it."""
+            await gate.wait()
+            return await begin(self.gateway, self.record).done()
+
+        def end(self) -> None:
+            """Nothing to end."""
+
+    def push(gateway: str, record: Record, *, durable: bool = True) -> object:
+        return Late(gateway, record) if record.value == b"first" else begin(gateway, record, durable=durable)
+
+    monkeypatch.setattr(owner.dht._pushing, "begin", push)
+    writing = asyncio.create_task(owner.dht.write(key, b"first", expected=None))
+    while (first := await fleet.planes[0].dht.read(key)) is None:
+        await asyncio.sleep(0.01)
+    later = await fleet.planes[2].dht.write(key, b"second", expected=first.version)
+    gate.set()
+    assert await writing == first.version
+    for plane in fleet.planes.values():
+        held = await plane.store.record(key)
+        assert held is not None
+        assert (held.value, held.version) == (b"second", later)
+
+
 async def test_one_of_many_writers_at_many_gateways_wins(fleet: Fleet) -> None:
     """Thirty writers at three gateways increment a counter by read and compare-and-set: none is lost or doubled."""
     key = fleet.owned_by(1)

@@ -2,8 +2,9 @@
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError
 from appliance.plane.versions import (
@@ -19,6 +20,7 @@ from appliance.plane.versions import (
     decide,
     descends,
     digest,
+    follows_here,
     increment,
     merge,
     settle,
@@ -199,3 +201,28 @@ def test_bad_records_from_elsewhere_are_refused(record: Record) -> None:
 def test_records_survive_the_wire(record: Record) -> None:
     """A record is the same after JSON."""
     assert msgspec.json.decode(msgspec.json.encode(record), type=Record) == record
+
+
+@given(records, st.integers(1, 4))
+def test_what_a_gateway_decides_upon_a_record_follows_it_here(record: Record, decisions: int) -> None:
+    """A chain of one gateway's own decisions follows each record it began with, and none follows a later one."""
+    chain = [record]
+    for number in range(decisions):
+        current = chain[-1]
+        expected = None if current.deleted else current.version
+        asked = Write(key="k", value=b"%d" % number, expected=expected, write=f"new{number}")
+        chain.append(decide(current, asked, "a"))
+    for earlier in range(len(chain)):
+        for later in range(len(chain)):
+            assert follows_here(chain[later], chain[earlier], "a") == (later > earlier)
+            assert not follows_here(chain[later], chain[earlier], "b")
+
+
+@given(records, records)
+def test_what_was_settled_with_anothers_write_follows_nothing_here(record: Record, other: Record) -> None:
+    """Where another gateway has ordered a write meanwhile the record may be gone: that is for its writer to hear."""
+    decided = replace(record, version=increment(record.version, "a"), write="w3")
+    # Of its own decisions others know none that it has not made itself yet.
+    assume(other.version.get("a", 0) <= decided.version["a"])
+    assume(concurrent(decided.version, other.version))
+    assert not follows_here(settle(decided, other, by_bytes), decided, "a")
