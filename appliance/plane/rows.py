@@ -88,16 +88,23 @@ def read_kept(db: sqlite3.Connection, prefix: str) -> list[tuple[str, bytes]]:
 def _rows(
     db: sqlite3.Connection, source: str, columns: str, prefix: str, decoder: "msgspec.json.Decoder[list[T]]", most: int
 ) -> Iterator[T]:
-    """`columns` of the rows whose `key`, the first of them, has that prefix; read in pages of `most`."""
+    """`columns` of the rows whose `key`, the first of them, has that prefix; read in pages of at most `most`."""
     # So that the index serves it. Without a prefix there is no end: a key may begin with the last code point too.
     end, bounds = ("AND key < ?", (prefix + _LAST,)) if prefix else ("", ())
     sql = (
         f"SELECT json_group_array(json_array({columns})) FROM "  # noqa: S608 - texts of ours
-        f"(SELECT {source} WHERE key >= ? {end} ORDER BY key LIMIT {most})"
+        f"(SELECT {source} WHERE key >= ? {end} ORDER BY key LIMIT ?)"
     )
     first = prefix
     while True:
-        page = decoder.decode(db.execute(sql, (first, *bounds)).fetchone()[0])
+        try:
+            (text,) = db.execute(sql, (first, *bounds, most)).fetchone()
+        except sqlite3.DataError:  # longer than a text may be: the values are large
+            if most == 1:
+                raise
+            most //= 2
+            continue
+        page = decoder.decode(text)
         yield from page
         if len(page) < most:
             return

@@ -62,7 +62,7 @@ def increment(version: VersionVector, gateway: str) -> VersionVector:
 def follows_here(later: Record, record: Record, gateway: str) -> bool:
     """Whether `later` was decided by `gateway` upon `record`, and upon nothing that anybody else ordered meanwhile.
 
-    Then their versions differ in that gateway's own count alone: what `settle` makes of two counts for both.
+    Then their versions differ in that gateway's own count alone; what `settle` makes of two has the counts of both.
     """
     counts = later.version.get(gateway, 0), record.version.get(gateway, 0)
     return counts[0] > counts[1] and later.version == {**record.version, gateway: counts[0]}

@@ -63,3 +63,17 @@ def test_pages_of_plain_keys_hold_what_was_put(kept: dict[str, bytes], prefix: s
     ordered = sorted(kept.items(), key=lambda each: each[0].encode())
     assert read_kept(db, "") == ordered
     assert read_kept(db, prefix) == [each for each in ordered if each[0].startswith(prefix)]
+
+
+def test_large_values_come_in_smaller_pages() -> None:
+    """Where a page is longer than SQLite lets a text be, all rows come all the same; a row that is alone fails."""
+    db = _file()
+    records = [Record(key=f"k{number:02}", value=b"x" * (900 if number % 3 else 9), write="w") for number in range(10)]
+    for record in records:
+        put_row(db, record)
+    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2500)
+    with patch.object(rows, "_MOST_VALUES", 8):
+        assert read_records(db, "k") == records
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 1500)
+        with pytest.raises(sqlite3.DataError):
+            read_records(db, "k")
