@@ -193,12 +193,7 @@ class Served:
         answering, expr = self._answering, self.expr
         size = len(payload)
         reply = partial(self._direct_answer, asked)
-        if asked.key != self._door:
-            # Asked again as a query it is refused, and whoever asked learns by whom.
-            error = UnreachableError(f"{expr}: {link.WRONG_DOOR}")
-            begin = partial(answering.refuse, f"misrouted {self.name}", expr, partial(_again, reply), error)
-            size = 0
-        elif size > link.MOST_DIRECT:
+        if size > link.MOST_DIRECT:
             error = PayloadError(f"{expr}: {size:,} bytes", remedy=f"at most {link.MOST_DIRECT:,} in a message")
             begin = partial(answering.refuse, f"oversize {self.name}", expr, reply, error)
             size = 0
@@ -209,8 +204,3 @@ class Served:
             begin = partial(answering.begin, self, expr, data, reply)
         if not self._wire.inbox.post(begin, size):
             reply(None, RefusedError("too busy", remedy="try again in a moment"))
-
-
-def _again(reply: Answer, _: bytes | None, __: SwiftbotError | None) -> None:
-    """Have a question asked again, as a query."""
-    reply(b"", None)

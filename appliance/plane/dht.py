@@ -19,6 +19,7 @@ import structlog
 from appliance.errors import ConflictError, DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
 from appliance.plane.absence import Absence
+from appliance.plane.fastpath import FastPath
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, StoreAsk, Written
 from appliance.plane.pulse import Pulse
@@ -90,8 +91,12 @@ class Dht:
         voting.learn = self._pushing.learn
         self._unsaved: set[str] = set()
         """Keys whose last decision here the replicas may have and the disk has not."""
+        self._fast = FastPath(
+            config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
+            pushing=self._pushing, unsaved=self._unsaved, agree=self._agree,
+        )  # fmt: skip
         rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, direct=True, at_once=self._read_at_once)
-        rpc.register("dht_write", Write, self._on_write, exchange=False, direct=True)
+        rpc.register("dht_write", Write, self._on_write, exchange=False, direct=True, at_once=self._write_at_once)
         rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, direct=True, at_once=self._store_at_once)
         rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
         rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
@@ -217,7 +222,7 @@ class Dht:
             try:
                 (owner,) = await self._membership.holders(asked.key, 1)
                 if owner == self._gateway:
-                    return (await self._on_write(asked)).version
+                    return (await self._fast.write(asked) or await self._on_write(asked)).version
                 answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 # Dead, not yet known to be; or of another mind about who owns the key: both pass.
@@ -283,7 +288,10 @@ class Dht:
         finally:
             for each in pushes:
                 each.end()
-        newer = [answer for answer in answers if answer is not None]
+        return await self._agree(record, asked, [answer for answer in answers if answer is not None])
+
+    async def _agree(self, record: Record, asked: Write, newer: list[Record]) -> VersionVector:
+        """The version that stands once replicas and this gateway agree; `newer`: what the former hold in its place."""
         if newer:
             newer = await self._not_from_here(newer, record)
         if not newer:
@@ -293,6 +301,7 @@ class Dht:
             record = await self.keep(each)
         if record.write != asked.write:
             raise ConflictError(f"{record.key} was written elsewhere too", remedy="read it and decide again")
+        others = [each for each in self._replicas(record.key) if each != self._gateway]
         await asyncio.gather(*(self._pushing.push(each, record) for each in others))
         return record.version
 
@@ -369,6 +378,10 @@ class Dht:
             answer(Found(record))
         return record is not None
 
+    def _write_at_once(self, asked: Write, answer: AtOnce) -> bool:
+        """Order an ordinary write on Zenoh's thread."""
+        return self._fast.order(check_write(asked, max_bytes=self._config.max_record_bytes), answer)
+
     def _store_at_once(self, asked: StoreAsk, answer: AtOnce) -> bool:
         """Have the store's thread keep a record and answer, without a turn of the event loop."""
         record = check_record(asked.record, max_bytes=self._config.max_record_bytes)
@@ -412,7 +425,8 @@ class Dht:
         return self._membership.ring.successors(key, self._config.replicas)
 
     async def close(self) -> None:
-        """Give up what is still being pushed."""
+        """Give up what is still being written and pushed."""
+        await self._fast.close()
         await self._pushing.close()
 
 

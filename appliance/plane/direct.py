@@ -1,8 +1,9 @@
 """Small questions between gateways as plain messages: a third less time there and back than a query of Zenoh's.
 
 A query is kept in a table on its way, has a timer, and ends by a message of its own. A direct question is one message
-to a door, `{key}/@direct`, and its answer one to the session that asked, `@answers/{session}`: keys that no wildcard
-matches, so that neither the recorder nor a listener to everything is sent them. What a query tells is told here too:
+to a door, and its answer one to the session that asked, `@answers/{session}`: keys that no wildcard matches, so that
+neither the recorder nor a listener to everything is sent them. All keys that a gateway answers for have one door,
+`gw/{gateway}/rpc/@direct`: so one way to each other gateway is made and kept. What a query tells is told here too:
 
 - that nobody is there: Zenoh knows who listens at a door. Where nobody does, the question goes as a query, which says
   so; when whoever listened goes, the questions that wait for it end as those that may have been heard;
@@ -13,6 +14,7 @@ matches, so that neither the recorder nor a listener to everything is sent them.
 # The library's stubs leave out the return types of methods that return nothing.
 
 import contextlib
+import itertools
 import secrets
 import threading
 from collections import OrderedDict
@@ -20,12 +22,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import structlog
 import zenoh
 
 from appliance.errors import SwiftbotError
 from appliance.plane import link, threads
-from appliance.plane.keys import DOOR
+from appliance.plane.keys import door_of
 from appliance.plane.wire import Closer, Wire
+
+log = structlog.get_logger(__name__)
 
 Answer = Callable[[bytes | None, SwiftbotError | None], None]
 """Answers one question, from any thread; an empty answer has it asked again as a query."""
@@ -35,6 +40,8 @@ _MOST_WAYS = 256
 _ANSWERED, _FAILED = b"+", b"-"
 _SESSION = frozenset(b"0123456789abcdef")
 _LONGEST = 32
+_MOST_KEY = 200
+"""Of a misrouted question's key that is logged."""
 
 
 class Asked(NamedTuple):
@@ -50,6 +57,17 @@ class _Waiting(NamedTuple):
     way: "Way"
     on_reply: Callable[[bytes | None, SwiftbotError | None], None]
     on_gone: Callable[[], None]
+    here: bool = False
+    """Both are called where they come, on Zenoh's threads."""
+
+
+class _Door(NamedTuple):
+    """What is served beside each other."""
+
+    takes: dict[bytes, Callable[[Asked, zenoh.ZBytes], None]]
+    """Key -> what has the questions for it; looked at on Zenoh's threads."""
+    name: str
+    subscriber: "zenoh.Subscriber[None]"
 
 
 class Way:
@@ -60,16 +78,11 @@ class Way:
     thread, told on Zenoh's: what is told while it is looked is the newer.
     """
 
-    def __init__(self, raw: zenoh.Session, key: str, on_gone: Callable[["Way"], None]) -> None:
-        self.key = key.encode()
+    def __init__(self, raw: zenoh.Session, door: str, on_gone: Callable[["Way"], None]) -> None:
+        self.door = door
         self._listened, self._told = False, 0
         self._lock = threading.Lock()
-        self._publisher = raw.declare_publisher(
-            f"{key}/{DOOR}",
-            congestion_control=_DROP,
-            priority=_HIGH,
-            express=True,
-        )
+        self._publisher = raw.declare_publisher(door, congestion_control=_DROP, priority=_HIGH, express=True)
         self.put = self._publisher.put
         self._on_gone = on_gone
         handler = threads.callback(self._changed)
@@ -86,6 +99,11 @@ class Way:
         """A question stayed unanswered: look before the next."""
         with self._lock:
             self._listened = False
+
+    @property
+    def listened(self) -> bool:
+        """Whether somebody is known to listen there, without looking; from any thread."""
+        return self._listened
 
     @property
     def open(self) -> bool:
@@ -107,17 +125,19 @@ class Way:
 
 
 class Direct:
-    """The direct questions of one session, asked and answered; asked on the event loop's thread."""
+    """The direct questions of one session, asked on the event loop's thread or (`ask_here`) any, and answered."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
         self._session = str(wire.raw.zid())
         self._session_text = self._session.encode()
         self._ways: OrderedDict[str, Way] = OrderedDict()
+        """Door -> the way there."""
         self._waiting: dict[int, _Waiting] = {}
         # An answer that Zenoh delivers to the wrong session finds nobody who waits for such a number.
-        self._number = secrets.randbits(62)
+        self._numbers = itertools.count(secrets.randbits(62))
         self._listening: zenoh.Subscriber[None] | None = None
+        self._served: dict[str, _Door] = {}
         self._answers = wire.keys.answers("")
 
     # --- asking -----------------------------------------------------------------------------------------------
@@ -137,8 +157,9 @@ class Direct:
         if self._wire.closed or self._wire.config.mode != "peer":
             # For whom a router stands between, each way would be kept there too.
             return None
-        way = self._ways.get(key) or self._way(key)
-        self._number = number = self._number + 1
+        door = door_of(key)
+        way = self._ways.get(door) or self._way(door)
+        number = next(self._numbers)
         # Before it is looked whether anybody listens: who goes after that look ends it.
         self._waiting[number] = _Waiting(way, on_reply, on_gone)
         if not way.open:
@@ -147,10 +168,43 @@ class Direct:
         if self._listening is None:
             self._listen()
         try:
-            way.put(payload, attachment=b"%d %s %s" % (number, self._session_text, way.key))
+            self._put(way, number, key, payload)
         except zenoh.ZError as error:
             link.not_sent(key, error)
         return number
+
+    def _put(self, way: Way, number: int, key: str, payload: bytes) -> None:
+        way.put(payload, attachment=b"%d %s %s" % (number, self._session_text, key.encode()))
+
+    def known_way(self, key: str) -> Way | None:
+        """The way to the door of `key`, where it is known that somebody listens; from any thread."""
+        way = None if self._wire.closed or self._listening is None else self._ways.get(door_of(key))
+        return way if way is not None and way.listened else None
+
+    def ask_here(
+        self,
+        way: Way,
+        key: str,
+        payload: bytes,
+        on_reply: Callable[[bytes | None, SwiftbotError | None], None],
+        on_gone: Callable[[], None],
+    ) -> int | None:
+        """Do the same from any thread; both callbacks come on Zenoh's, and must not wait.
+
+        Returns:
+            The question's number; None: nobody listens any more, or it could not be sent.
+        """
+        number = next(self._numbers)
+        self._waiting[number] = _Waiting(way, on_reply, on_gone, here=True)
+        if way.listened:
+            try:
+                self._put(way, number, key, payload)
+            except zenoh.ZError as error:
+                link.not_sent(key, error)
+            else:
+                return number
+        self._waiting.pop(number, None)
+        return None
 
     def forget(self, number: int) -> None:
         """Wait for an answer no more."""
@@ -158,19 +212,28 @@ class Direct:
         if waiting is not None:
             waiting.way.doubt()
 
-    def _way(self, key: str) -> Way:
+    def _way(self, door: str) -> Way:
         while len(self._ways) >= _MOST_WAYS:
             _, oldest = self._ways.popitem(last=False)
             self._gone(oldest)
             oldest.close()
-        way = self._ways[key] = Way(self._wire.raw, key, self._gone)
+        way = self._ways[door] = Way(self._wire.raw, door, self._gone)
         return way
 
     def _gone(self, way: Way) -> None:
         """Nobody listens there any more; on a thread of Zenoh's."""
         for number, each in tuple(self._waiting.items()):
             if each.way is way and self._waiting.pop(number, None) is not None:
-                self._wire.inbox.post(each.on_gone, must=True)
+                self._deliver(each, each.on_gone)
+
+    def _deliver(self, waiting: _Waiting, call: Callable[[], None], size: int = 0) -> None:
+        if not waiting.here:
+            self._wire.inbox.post(call, size, must=True)
+            return
+        try:
+            call()
+        except Exception:  # supervision boundary: a defect of whoever asked must not end what Zenoh has to tell others
+            log.exception("whoever asked failed", door=waiting.way.door)
 
     def _listen(self) -> None:
         if self._listening is None:
@@ -187,29 +250,51 @@ class Direct:
             return  # late, or nobody's
         data = sample.payload
         if kind == _ANSWERED and len(data) <= link.MOST_DIRECT:
-            self._wire.inbox.post(partial(waiting.on_reply, data.to_bytes(), None), len(data), must=True)
+            self._deliver(waiting, partial(waiting.on_reply, data.to_bytes(), None), len(data))
         else:
             error = link.error_from(data.to_bytes()[: link.MOST_ERROR])
-            self._wire.inbox.post(partial(waiting.on_reply, None, error), must=True)
+            self._deliver(waiting, partial(waiting.on_reply, None, error))
 
     # --- answering --------------------------------------------------------------------------------------------
 
     def serve(self, key: str, take: Callable[[Asked, zenoh.ZBytes], None]) -> Closer:
-        """Have the questions at the door of `key` delivered, on Zenoh's threads."""
+        """Have the direct questions for `key` delivered, on Zenoh's threads."""
         self._listen()
-        name = f"malformed {self._wire.name(key)}/{DOOR}"
+        name = door_of(key)
+        door = self._served.get(name)
+        if door is None:
+            door = self._served[name] = _Door({}, name, self._wire.raw.declare_subscriber(name, self._deliverer(name)))
+        door.takes[key.encode()] = take
+
+        def end() -> None:
+            door.takes.pop(key.encode(), None)
+            if not door.takes and self._served.get(name) is door:
+                del self._served[name]
+                door.subscriber.undeclare()
+
+        return Closer(end)
+
+    def _deliverer(self, name: str) -> "zenoh.handlers.Callback[zenoh.Sample]":
+        beside = name.rpartition("/")[0].encode()
+        malformed, misrouted = f"malformed {self._wire.name(name)}", f"misrouted {self._wire.name(name)}"
 
         def deliver(sample: zenoh.Sample) -> None:
             attached = sample.attachment
             asked = _read(attached.to_bytes()) if attached is not None else None
+            door = self._served.get(name)
             if asked is None:
-                refuse = partial(self._wire.refuse, name, reason="it does not say who asks what")
-                self._wire.inbox.post(refuse)
-            else:
+                self._wire.inbox.post(partial(self._wire.refuse, malformed, reason="it does not say who asks what"))
+                return
+            take = None if door is None else door.takes.get(asked.key)
+            if take is not None:
                 take(asked, sample.payload)
+                return
+            if asked.key.rpartition(b"/")[0] != beside:
+                self._wire.inbox.post(partial(self._wire.refuse, misrouted, key=repr(asked.key[:_MOST_KEY])))
+            # Asked again as a query it is refused, and whoever asked learns by whom.
+            self.answer(asked, b"", None)
 
-        handler = threads.callback(deliver)
-        return Closer(self._wire.raw.declare_subscriber(f"{key}/{DOOR}", handler).undeclare)
+        return threads.callback(deliver)
 
     def answer(self, asked: Asked, answer: bytes | None, error: SwiftbotError | None) -> None:
         """Answer a question, from any thread; with nothing where it is to be asked again as a query."""

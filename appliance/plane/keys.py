@@ -14,6 +14,11 @@ DOOR = "@direct"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
 
 
+def door_of(key: str) -> str:
+    """Where direct questions for a key, and for all others beside it, are put."""
+    return f"{key.rpartition('/')[0]}/{DOOR}"
+
+
 def check_name(name: str, what: str) -> str:
     """Return `name` if it may be one chunk of a key; PayloadError otherwise."""
     if not _NAME.fullmatch(name):
@@ -61,9 +66,9 @@ class Keys:
         """Queryable: a request to one gateway, answered with the verb's reply or ErrorReply."""
         return f"{self.root}/gw/{gateway}/rpc/{verb}"
 
-    def direct(self, gateway: str, verb: str) -> str:
-        """Put by the asking gateway: a small question to one gateway, as a message (`plane.direct`)."""
-        return f"{self.rpc(gateway, verb)}/{DOOR}"
+    def direct(self, gateway: str) -> str:
+        """Put by the asking gateway: a small question for one of its verbs, as a message (`plane.direct`)."""
+        return door_of(self.rpc(gateway, ""))
 
     def answers(self, session: str) -> str:
         """Put by the gateway that was asked: answers to the direct questions of that Zenoh session."""

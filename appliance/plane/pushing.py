@@ -67,25 +67,27 @@ class Pushing:
         call = self._rpc.begin(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
         return Push(call, partial(self._heard, gateway, record))
 
-    async def push(self, gateway: str, record: Record) -> Record | None:
+    async def push(self, gateway: str, record: Record, *, durable: bool = True) -> Record | None:
         """Have a replica store a record; returns what it holds if that is something else."""
-        return await self.begin(gateway, record).done()
+        return await self.begin(gateway, record, durable=durable).done()
 
     async def _heard(self, gateway: str, record: Record, call: Call[Found]) -> Record | None:
         try:
             answer = await call.answer()
-        except UnreachableError:
-            return None  # gone: its successor in the replica set takes the record when it reconciles
-        except (DeadlineError, RefusedError) as error:
-            log.warning("a replica is slow", replica=gateway, key=record.key, reason=str(error))
-            self._later(self._push_again(gateway, record.key))
-            return None
         except SwiftbotError as error:
-            log.error(  # noqa: TRY400 - the replica's own reason says more than our traceback
-                "a replica cannot store", replica=gateway, key=record.key, reason=str(error)
-            )
+            self.failed(gateway, record, error)
             return None
         return answer.record
+
+    def failed(self, gateway: str, record: Record, error: SwiftbotError) -> None:
+        """A replica has not said that it stored a record: it is offered it again, unless it is gone or cannot."""
+        if isinstance(error, UnreachableError):
+            return  # gone: its successor in the replica set takes the record when it reconciles
+        if isinstance(error, DeadlineError | RefusedError):
+            log.warning("a replica is slow", replica=gateway, key=record.key, reason=str(error))
+            self._later(self._push_again(gateway, record.key))
+        else:
+            log.error("a replica cannot store", replica=gateway, key=record.key, reason=str(error))
 
     async def learn(self, record: Record) -> None:
         """A quorum has chosen a record: the ordinary copies follow, while the writer goes on."""

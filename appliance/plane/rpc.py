@@ -13,10 +13,11 @@ from typing import Any, Generic, TypeVar
 import msgspec
 from msgspec import Raw, Struct
 
-from appliance.errors import ConfigError, PayloadError, SwiftbotError
+from appliance.errors import ConfigError, PayloadError, SwiftbotError, UnreachableError
 from appliance.model import ErrorReply, encode
+from appliance.plane import link
 from appliance.plane.asking import Question
-from appliance.plane.session import Answer, Session
+from appliance.plane.session import Answer, Session, Way
 
 Q = TypeVar("Q", bound=Struct)
 R = TypeVar("R", bound=Struct)
@@ -57,15 +58,7 @@ class Call(Generic[R]):
 
     async def answer(self) -> R:
         """Wait for the answer; errors as of `Rpc.call`."""
-        answer = await self._question.answer()
-        try:
-            return msgspec.json.decode(answer, type=self._reply)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            key = self._session.keys.rpc(self._gateway, self._verb)
-            self._session.refuse(f"malformed answer {self._verb}", key=key, reason=str(error))
-            raise PayloadError(
-                f"{self._gateway} answered {self._verb} with no {self._reply.__name__}: {error}"
-            ) from error
+        return _decoded(self._session, self._gateway, self._verb, await self._question.answer(), self._reply)
 
     def end(self) -> None:
         """Wait for it no more."""
@@ -161,10 +154,50 @@ class Rpc:
         question = self._session.ask(key, encode(request), timeout_s=timeout_s, direct=direct)
         return Call(self._session, question, gateway, verb, reply)
 
+    def known_way(self, gateway: str, verb: str) -> Way | None:
+        """The way to a gateway's verb for `ask_here`, where it is known that somebody listens; from any thread."""
+        return self._session.known_way(self._session.keys.rpc(gateway, verb))
+
+    def ask_here(
+        self, way: Way, gateway: str, verb: str, payload: bytes, on_reply: Callable[[bytes | SwiftbotError], None]
+    ) -> int | None:
+        """Ask a gateway from any thread, without waiting.
+
+        The answer as it came, or why there is none, comes on a thread of Zenoh's.
+
+        Returns:
+            The question's number, to be forgotten (`forget`) where the answer is not waited for any more; None: it was
+            not sent. An answer that is empty is too large for a message: ask again (`begin`).
+        """
+
+        def reply(data: bytes | None, error: SwiftbotError | None) -> None:
+            on_reply(data if data is not None else error or SwiftbotError("no answer"))
+
+        def gone() -> None:
+            on_reply(UnreachableError("whoever was asked went away", remedy=link.NOBODY_REMEDY, sent=True))
+
+        return self._session.ask_here(way, self._session.keys.rpc(gateway, verb), payload, reply, gone)
+
+    def forget(self, number: int) -> None:
+        """Wait no more for the answer to what was asked with `ask_here`; from any thread."""
+        self._session.forget(number)
+
+    def decode(self, gateway: str, verb: str, answer: bytes, reply: type[R]) -> R:
+        """Read an answer to `ask_here`; PayloadError, counted, when it is no `reply`."""
+        return _decoded(self._session, gateway, verb, answer, reply)
+
     def close(self) -> None:
         """Answer no more."""
         if self._verbs is not None:
             self._verbs.close()
+
+
+def _decoded(session: Session, gateway: str, verb: str, answer: bytes, reply: type[R]) -> R:
+    try:
+        return msgspec.json.decode(answer, type=reply)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        session.refuse(f"malformed answer {verb}", key=session.keys.rpc(gateway, verb), reason=str(error))
+        raise PayloadError(f"{gateway} answered {verb} with no {reply.__name__}: {error}") from error
 
 
 def _at_once(

@@ -19,7 +19,7 @@ import zenoh
 from appliance.plane import link
 from appliance.plane.answering import Answering
 from appliance.plane.asking import Asking
-from appliance.plane.direct import Answer, Direct
+from appliance.plane.direct import Answer, Direct, Way
 from appliance.plane.doors import Doors
 from appliance.plane.keys import Keys
 from appliance.plane.presence import Presence
@@ -29,7 +29,7 @@ from appliance.plane.sockets import SocketWatch
 from appliance.plane.verbs import Verbs
 from appliance.plane.wire import Closer, Wire
 
-__all__ = ["Answer", "Closer", "Message", "Session"]
+__all__ = ["Answer", "Closer", "Message", "Session", "Way"]
 
 _CLOSE_S = 2.0
 """How long a closing session keeps sending what waits."""
@@ -61,6 +61,7 @@ class Session:
         self.query = self._asking.query
         self.ask = self._asking.ask
         self.query_all = self._asking.query_all
+        self.known_way, self.ask_here, self.forget = direct.known_way, direct.ask_here, direct.forget
         self.declare_alive = presence.declare_alive
         self.alive_now = presence.alive_now
         self.watch_alive = presence.watch_alive

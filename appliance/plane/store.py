@@ -41,6 +41,8 @@ class _Call(NamedTuple):
     writes: bool
     durable: bool
     mark: Mark = NOTHING
+    single: bool = False
+    """It writes with one statement at most, which needs no transaction around it."""
 
 
 class Store:
@@ -148,9 +150,9 @@ class Store:
         `decide` runs on the store's thread and must be pure: it may be run again. What it raises is raised here.
         Returns what it returned; nothing is written when that is None or what is stored already.
         """
-        return await self._call(
-            partial(self._change, key, decide), writes=True, durable=durable, mark=Mark(touches=key)
-        )
+        future: asyncio.Future[Record | None] = self._loop.create_future()
+        self._submit(_change_call(partial(self._change, key, decide), partial(self._post, future), key, durable))
+        return await future
 
     def change_soon(
         self, key: str, decide: Callable[[Record | None], Record | None], *, durable: bool = True
@@ -179,7 +181,7 @@ class Store:
             self._post(decided, record, None)
             return record
 
-        self._submit(_Call(run, done, writes=True, durable=durable, mark=Mark(touches=key)))
+        self._submit(_change_call(run, done, key, durable))
         return decided, committed
 
     def _decide_now(
@@ -209,12 +211,44 @@ class Store:
             for each in (decided, committed):
                 each.set_result(record)
             return True
-        done, mark = partial(self._post, committed), Mark(decided=record)
-        self._submit(_Call(partial(self._put, record), done, writes=True, durable=durable, mark=mark), wake=False)
+        self._submit_decided(record, partial(self._post, committed), durable=durable)
         # The store's thread wants the interpreter, and so does whoever sends the decision to others now: that first.
-        self._loop.call_soon(self._wake)
+        self._loop.call_soon(self.wake)
         decided.set_result(record)
         return True
+
+    def decide_now(
+        self,
+        key: str,
+        decide: Callable[[Record | None], Record | None],
+        done: Callable[[Record | None, Exception | None], None],
+        *,
+        durable: bool = True,
+    ) -> Record | None:
+        """Decide on the thread that calls, any, and have the store's commit it; whoever calls wakes that (`wake`).
+
+        Returns:
+            What was decided, of which `done` is told on the store's thread once it is committed; None: nothing was
+            done, since the record's present state is not known here, or it is to stay as it is.
+
+        Raises:
+            RefusedError: the store is closed, or too much waits for the disk.
+            Exception: what `decide` raises.
+        """
+        with self._some:
+            found = self._ahead.known(key, self._picture.look)
+            record = None if found is None else decide(found.record)
+            if found is None or record is None or record == found.record:
+                return None
+            self._submit_decided(record, done, durable=durable)
+        return record
+
+    def _submit_decided(
+        self, record: Record, done: Callable[[Record | None, Exception | None], None], *, durable: bool
+    ) -> None:
+        mark = Mark(decided=record)
+        call = _Call(partial(self._put, record), done, writes=True, durable=durable, mark=mark, single=True)
+        self._submit(call, wake=False)
 
     def change_then(
         self,
@@ -229,9 +263,7 @@ class Store:
         Raises:
             RefusedError: the store is closed, or too much waits for the disk.
         """
-        self._submit(
-            _Call(partial(self._change, key, decide), done, writes=True, durable=durable, mark=Mark(touches=key))
-        )
+        self._submit(_change_call(partial(self._change, key, decide), done, key, durable))
 
     def _change(
         self, key: str, decide: Callable[[Record | None], Record | None], db: sqlite3.Connection
@@ -301,7 +333,8 @@ class Store:
             if wake:
                 self._some.notify()
 
-    def _wake(self) -> None:
+    def wake(self) -> None:
+        """Have the store's thread look what waits; from any thread."""
         with self._some:
             self._some.notify()
 
@@ -357,10 +390,12 @@ class Store:
 
     def _commit(self, db: sqlite3.Connection, batch: list[_Call]) -> list[tuple[Any, Exception | None]]:
         writes = any(call.writes for call in batch)
+        alone = len(batch) == 1 and batch[0].single
         self._changed.clear()
         if writes:
             self._set_synchronous(db, "FULL" if any(call.durable for call in batch if call.writes) else "NORMAL")
-            db.execute("BEGIN IMMEDIATE")
+            if not alone:
+                db.execute("BEGIN IMMEDIATE")
         try:
             outcomes: list[tuple[Any, Exception | None]] = []
             for call in batch:
@@ -371,7 +406,8 @@ class Store:
                 except Exception as error:  # noqa: BLE001 - a decision's own error is its caller's, whatever it is
                     outcomes.append((None, error))
             if writes:
-                db.execute("COMMIT")
+                if not alone:
+                    db.execute("COMMIT")
                 self._show()
         except BaseException:
             self._changed.clear()
@@ -414,6 +450,15 @@ class Store:
             self._closing = True
             self._some.notify()
         await asyncio.to_thread(self._thread.join)
+
+
+def _change_call(
+    run: Callable[[sqlite3.Connection], Record | None],
+    done: Callable[[Any, Exception | None], None],
+    key: str,
+    durable: bool,
+) -> _Call:
+    return _Call(run, done, writes=True, durable=durable, mark=Mark(touches=key), single=True)
 
 
 def _looked_at(future: asyncio.Future[Record | None]) -> None:

@@ -21,7 +21,7 @@ from appliance.plane.settings import PlaneConfig
 pytestmark = pytest.mark.anyio
 
 KEY = "swiftbot/f/gw/b/rpc/ask"
-DOOR = f"{KEY}/@direct"
+DOOR = "swiftbot/f/gw/b/rpc/@direct"
 
 
 @pytest.fixture
@@ -171,7 +171,7 @@ async def test_whoever_is_known_to_listen_is_looked_for_again_in_doubt(pair: tup
     door = _Door(other)
     go.set()
     await door.known(one)
-    way = one._asking._direct._ways[KEY]
+    way = one._asking._direct._ways[DOOR]
     assert await one.query(KEY, b"x", timeout_s=5, direct=True) == b"x"
     assert way._listened
     go.clear()
@@ -200,7 +200,7 @@ async def test_what_is_told_while_it_is_looked_is_the_newer(
     one, other = pair
     other.serve(KEY, _echo, direct=True)
     await _Door(other).known(one)
-    way = one._asking._direct._ways[KEY]
+    way = one._asking._direct._ways[DOOR]
     gone = SimpleNamespace(matching=False)
 
     class Slow:
@@ -232,12 +232,17 @@ async def test_a_message_at_the_wrong_door_is_asked_again(pair: tuple[Session, S
     other.serve(KEY, handle, direct=True)
     await _Door(other).known(one)
     reached.clear()
-    way = one._asking._direct._ways[KEY]
-    right, way.key = way.key, b"swiftbot/f/gw/c/rpc/ask"
+    way = one._asking._direct._ways[DOOR]
+    put = way.put
+
+    def astray(payload: bytes, attachment: bytes) -> None:
+        put(payload, attachment=attachment.replace(b"/gw/b/", b"/gw/c/"))
+
+    way.put = astray  # pyright: ignore[reportAttributeAccessIssue]
     assert await one.query(KEY, b"x", timeout_s=5, direct=True) == b"x"
     assert reached == [b"x"]
-    assert other.refused == {"misrouted gw/b/rpc/ask": 1}
-    way.key = right
+    assert other.refused == {"misrouted gw/b/rpc/@direct": 1}
+    way.put = put
 
 
 async def test_bad_messages_reach_no_handler(pair: tuple[Session, Session]) -> None:
@@ -266,7 +271,7 @@ async def test_bad_messages_reach_no_handler(pair: tuple[Session, Session]) -> N
         b"9" * 40 + b" abc k",
     ):  # fmt: skip
         raw.put(DOOR, b"x", attachment=attached)
-    await until(lambda: other.refused.get("malformed gw/b/rpc/ask/@direct") == 11)
+    await until(lambda: other.refused.get("malformed gw/b/rpc/@direct") == 11)
     raw.put(DOOR, b"x" * (link.MOST_DIRECT + 1), attachment=f"7 abc {KEY}".encode())
     await until(lambda: answers)
     assert msgspec.json.decode(answers[0], type=ErrorReply).code == "payload"

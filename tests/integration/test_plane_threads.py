@@ -102,7 +102,7 @@ async def test_bad_reads_are_counted(fleet: Fleet) -> None:
     asked = session.keys.rpc("g1", "dht_read")
     bad = (b"", b"{", b"[]", b'{"key": 1}', b'{"key": ""}', b'{"key": "' + b"x" * 5000 + b'"}')
     for number, payload in enumerate(bad):
-        session._wire.raw.put(f"{asked}/@direct", payload, attachment=f"{number} abc {asked}".encode())
+        session._wire.raw.put(session.keys.direct("g1"), payload, attachment=f"{number} abc {asked}".encode())
     await until(lambda: owner.session.refused.get("malformed gw/g1/rpc/dht_read") == len(bad))
 
 
