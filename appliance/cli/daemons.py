@@ -31,10 +31,13 @@ def gateway(*, config: Path) -> int:
     """
     from appliance import config as configuration
     from appliance import gateway as daemon
+    from appliance.collector import gentle_collector
 
     loaded = configuration.load(config)
     logs.configure(level=loaded.log_level, style=loaded.log_format)
-    uvloop.run(daemon.run(loaded))
+    # Nothing is collected first: a gateway that is started again is wanted at once.
+    with gentle_collector(collect=False):
+        uvloop.run(daemon.run(loaded))
     return 0
 
 

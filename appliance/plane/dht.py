@@ -95,6 +95,7 @@ class Dht:
             config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
             pushing=self._pushing, unsaved=self._unsaved, agree=self._agree,
         )  # fmt: skip
+        self.on_ring_change.append(self._fast.ring_changed)
         rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, direct=True, at_once=self._read_at_once)
         rpc.register("dht_write", Write, self._on_write, exchange=False, direct=True, at_once=self._write_at_once)
         rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, direct=True, at_once=self._store_at_once)

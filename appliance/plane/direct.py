@@ -108,8 +108,10 @@ class Way:
     @property
     def open(self) -> bool:
         """Whether somebody listens there just now."""
-        if self._listened:
-            return True
+        return self._listened or self.look()
+
+    def look(self) -> bool:
+        """Ask Zenoh whether somebody listens there."""
         told = self._told
         # The stubs take the status for a bool; it is a structure with one.
         listened = self._publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
@@ -180,6 +182,14 @@ class Direct:
         """The way to the door of `key`, where it is known that somebody listens; from any thread."""
         way = None if self._wire.closed or self._listening is None else self._ways.get(door_of(key))
         return way if way is not None and way.listened else None
+
+    def make_way(self, key: str) -> None:
+        """Have the way to the door of `key` ready before the first question; on the event loop's thread."""
+        if not self._wire.closed and self._wire.config.mode == "peer" and len(self._ways) < _MOST_WAYS:
+            door = door_of(key)
+            way = self._ways.get(door) or self._way(door)
+            if not way.listened:
+                way.look()
 
     def ask_here(
         self,

@@ -43,6 +43,12 @@ _MOST_VALUE = 16 * 1024
 """Bytes of a value that fits into a plain message with all that goes with it."""
 _LOOK_S = 0.1
 """Between looks for replicas that are late."""
+_READY_S = 0.5
+"""After a change of the ring before ways are made to who is new: a gateway that starts has other things to do."""
+_NEXT_S = 0.01
+"""Between two ways."""
+_MOST_READY = 64
+"""Members beyond which ways are made only when they are needed."""
 _QUIET_LOOKS = 10
 """Looks that find nothing under way before nobody looks any more."""
 
@@ -152,6 +158,8 @@ class FastPath:
         self._loop = asyncio.get_running_loop()
         self._under_way: set[Copies] = set()
         self._mending: set[asyncio.Task[None]] = set()
+        self._readying: list[str] | None = None
+        """Members to whom ways are still to be made."""
         self._watching = False
         self._quiet = 0
         self._closed = False
@@ -223,6 +231,26 @@ class FastPath:
         if self._pulse.doubtful:
             raise RefusedError(f"{self._gateway} stood still and may have been succeeded", remedy="ask again")
         return decide(current, asked, self._gateway)
+
+    # --- ways -------------------------------------------------------------------------------------------------
+
+    def ring_changed(self) -> None:
+        """Others may hold copies from now on: the ways to them are made before the first write wants them."""
+        members = self._membership.members
+        if self._config.mode != "peer" or self._config.view != "full" or len(members) > _MOST_READY:
+            return
+        waits, self._readying = self._readying is not None, sorted(members - {self._gateway})
+        if not waits:
+            self._loop.call_later(_READY_S, self._make_ready)
+
+    def _make_ready(self) -> None:
+        if not self._readying or self._closed:
+            self._readying = None
+            return
+        name = self._readying.pop()
+        if self._rpc.known_way(name, "dht_store") is None:
+            self._rpc.make_way(name, "dht_store")
+        self._loop.call_later(_NEXT_S, self._make_ready)
 
     # --- what was heard ---------------------------------------------------------------------------------------
 

@@ -32,7 +32,10 @@ _RECORDS = msgspec.json.Decoder(list[tuple[str, str, str, int, str]])
 def put_row(db: sqlite3.Connection, record: Record) -> None:
     """Write a record."""
     db.execute(
-        "INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?, ?)",
+        # One that is there keeps its place: to replace it would write the pages of the key's index as well.
+        "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT(key) DO UPDATE SET value = excluded.value, "
+        "version = excluded.version, deleted = excluded.deleted, write = excluded.write, digest = excluded.digest, "
+        "updated_ns = excluded.updated_ns",
         (
             record.key,
             record.value,

@@ -154,6 +154,10 @@ class Rpc:
         question = self._session.ask(key, encode(request), timeout_s=timeout_s, direct=direct)
         return Call(self._session, question, gateway, verb, reply)
 
+    def make_way(self, gateway: str, verb: str) -> None:
+        """Have the way to a gateway's verbs ready before the first question; on the event loop's thread."""
+        self._session.make_way(self._session.keys.rpc(gateway, verb))
+
     def known_way(self, gateway: str, verb: str) -> Way | None:
         """The way to a gateway's verb for `ask_here`, where it is known that somebody listens; from any thread."""
         return self._session.known_way(self._session.keys.rpc(gateway, verb))

@@ -61,7 +61,8 @@ class Session:
         self.query = self._asking.query
         self.ask = self._asking.ask
         self.query_all = self._asking.query_all
-        self.known_way, self.ask_here, self.forget = direct.known_way, direct.ask_here, direct.forget
+        self.make_way, self.known_way = direct.make_way, direct.known_way
+        self.ask_here, self.forget = direct.ask_here, direct.forget
         self.declare_alive = presence.declare_alive
         self.alive_now = presence.alive_now
         self.watch_alive = presence.watch_alive

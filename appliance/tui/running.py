@@ -5,10 +5,10 @@ from pathlib import Path
 
 import structlog
 
+from appliance.collector import gentle_collector
 from appliance.model.open_enum import enums_open
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.collector import gentle_collector
 from appliance.tui.data import FleetView, View, take_own_log
 from appliance.tui.plans.history import History, default_file
 from appliance.tui.replay.source import ReplayView

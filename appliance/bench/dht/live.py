@@ -41,6 +41,9 @@ _SIDE = Path(__file__).with_name("kademlia_side.py")
 Layout = Literal["one process", "a process each"]
 _BLOCK = 50
 """Operations of one side before it is the other's turn."""
+_WARM = 2
+"""Turns of each side before any that counts: nodes meet, make links and files once, and run for days."""
+_KINDS = ("put", "get", "get_any_copy", "put_unsynced")
 _LINE_S = 60.0
 _VALUE = "x" * 400
 _FIRST_PORT, _LAST_PORT = 20_000, 30_000
@@ -63,7 +66,7 @@ def find_python() -> Path | None:
 async def run(
     *, nodes: int, count: int, layout: Layout = "one process", progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure `count` puts and gets on both sides.
+    """Measure `count` puts and gets on both sides, after some that do not count.
 
     Returns:
         `swiftbot`, `kademlia`, `kademlia_durable` and, in one process, `zenoh_alone`: what each did of `put`, `get`,
@@ -94,12 +97,17 @@ async def run(
             durable.mkdir()
             sides["kademlia_durable"] = await _kademlia(stack, python, nodes, layout, durable=durable)
             ops["kademlia_durable"] = ("put",)
+        progress(f"{_WARM * _BLOCK} operations of each kind that do not count")
+        for block in range(_WARM):
+            for what in _KINDS:
+                for name, side in sides.items():
+                    if what in ops[name]:
+                        await side.do(what, _keys(f"warm-{block}", what))
         times: dict[str, dict[str, list[float]]] = {name: {what: [] for what in ops[name]} for name in sides}
         for block in range(-(-count // _BLOCK)):
             progress(f"{min(count, (block + 1) * _BLOCK)} of {count}")
-            for what in ("put", "get", "get_any_copy", "put_unsynced"):
-                suffix = "-u" if what == "put_unsynced" else ""
-                keys = [f"bench/{block}-{number}{suffix}" for number in range(_BLOCK)]
+            for what in _KINDS:
+                keys = _keys(str(block), what)
                 for name, side in sides.items():
                     if what in ops[name]:
                         times[name][what] += await side.do(what, keys)
@@ -119,6 +127,12 @@ async def run(
             for part in ("p50", "p99")
         }
     return result
+
+
+def _keys(block: str, what: str) -> list[str]:
+    """Keys of a turn; what is got is what was put in it."""
+    suffix = "-u" if what == "put_unsynced" else ""
+    return [f"bench/{block}-{number}{suffix}" for number in range(_BLOCK)]
 
 
 class Side(Protocol):

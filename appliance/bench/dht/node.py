@@ -18,6 +18,7 @@ import uvloop
 from msgspec import Struct
 
 from appliance import logs
+from appliance.collector import gentle_collector
 from appliance.plane.dht import Dht
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
@@ -77,7 +78,8 @@ def tell(what: dict[str, Any]) -> None:
 def main() -> None:
     """Serve until standard input ends."""
     logs.configure(level="error", style="text")
-    uvloop.run(serve(msgspec.json.decode(sys.argv[1], type=NodeOptions)))
+    with gentle_collector(collect=False):  # as a gateway does
+        uvloop.run(serve(msgspec.json.decode(sys.argv[1], type=NodeOptions)))
 
 
 if __name__ == "__main__":

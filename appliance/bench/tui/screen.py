@@ -22,9 +22,9 @@ from textual.drivers.headless_driver import HeadlessDriver
 
 from appliance.bench.figures import finite, quantile, summary
 from appliance.bench.tui.plain import PlainApp
+from appliance.collector import gentle_collector
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.collector import gentle_collector
 from appliance.tui.data import FleetView
 from appliance.tui.grid import Grid
 from appliance.tui.settings import TuiConfig
