@@ -5,7 +5,6 @@ queued are known (`decided`); those that are made only when their turn comes are
 key. Pure; whoever calls holds the lock under which calls are queued.
 """
 
-from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -38,11 +37,11 @@ class Ahead:
 
     def __init__(self) -> None:
         self._decided: dict[str, Record] = {}
-        self._undecided: Counter[str] = Counter()
+        self._undecided: dict[str, int] = {}
 
     def known(self, key: str, look: Look) -> Known | None:
         """The record as it stands after all that is queued; None where that is not known."""
-        if self._undecided[key] or self._undecided[""]:
+        if key in self._undecided or "" in self._undecided:
             return None
         if (record := self._decided.get(key)) is not None:
             return Known(record, on_its_way=True)
@@ -52,16 +51,17 @@ class Ahead:
     def queued(self, mark: Mark) -> None:
         """A call was queued."""
         if mark.touches is not None:
-            self._undecided[mark.touches] += 1
+            self._undecided[mark.touches] = self._undecided.get(mark.touches, 0) + 1
         if mark.decided is not None:
             self._decided[mark.decided.key] = mark.decided
 
     def settled(self, mark: Mark) -> None:
         """It is committed and `look` shows what it did, or it has failed: it stands in no decision's way any more."""
         if mark.touches is not None:
-            self._undecided[mark.touches] -= 1
-            if not self._undecided[mark.touches]:
+            if self._undecided[mark.touches] == 1:
                 del self._undecided[mark.touches]
+            else:
+                self._undecided[mark.touches] -= 1
         # A later decision on the same key has taken its place.
         if mark.decided is not None and self._decided.get(mark.decided.key) is mark.decided:
             del self._decided[mark.decided.key]

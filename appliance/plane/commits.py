@@ -213,7 +213,10 @@ class Commits:
 
     def _durable(self, batch: list[Call]) -> bool:
         """Whether one of them must be on the disk when it is told."""
-        return any(call.durable and call.writes for call in batch)
+        for call in batch:  # noqa: SIM110 - most often it is one
+            if call.durable and call.writes:
+                return True
+        return False
 
     def _show(self) -> None:
         """Have the picture follow a commit."""

@@ -9,8 +9,8 @@ the membership differ for a moment, or a partition) make concurrent versions, wh
 import asyncio
 import contextlib
 import random
+import secrets
 import time
-import uuid
 from collections.abc import Callable
 from functools import partial
 
@@ -193,12 +193,12 @@ class Dht:
             ConfigError: `quorum`, and no voters are configured.
             PayloadError: the value or key is too large.
         """
-        asked = Write(key=key, value=value, expected=expected, write=uuid.uuid4().hex, durable=durable)
+        asked = Write(key=key, value=value, expected=expected, write=secrets.token_hex(16), durable=durable)
         return await (self._voting.write(asked) if quorum else self._write(asked))
 
     async def remove(self, key: str, *, expected: VersionVector, quorum: bool = False) -> None:
         """Remove a record; errors as for `write`."""
-        asked = Write(key=key, deleted=True, expected=expected, write=uuid.uuid4().hex)
+        asked = Write(key=key, deleted=True, expected=expected, write=secrets.token_hex(16))
         await (self._voting.write(asked) if quorum else self._write(asked))
 
     def voters(self, key: str) -> tuple[str, ...]:
@@ -417,7 +417,7 @@ class Dht:
             value=asked.value,
             deleted=asked.deleted,
             expected=asked.expected,
-            write=asked.write or uuid.uuid4().hex,
+            write=asked.write or secrets.token_hex(16),
         )
         check_write(write, max_bytes=self._config.max_record_bytes)
         return Written(await (self._voting.write(write) if asked.quorum else self._write(write)))

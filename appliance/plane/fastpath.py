@@ -37,6 +37,7 @@ log = structlog.get_logger(__name__)
 
 STORED: Final = encode(Found())
 """What a replica answers that keeps just what it was given."""
+_ALL_STORED: Final = frozenset({STORED})
 _MOST = 1024
 """Writes under way here; more go by the event loop, which refuses what is too much."""
 _MOST_VALUE = 16 * 1024
@@ -121,7 +122,7 @@ class Copies:
     @property
     def stored(self) -> bool:
         """Whether all have just what was decided."""
-        return self.problem is None and all(outcome == STORED for outcome in self.outcomes.values())
+        return self.problem is None and set(self.outcomes.values()) <= _ALL_STORED
 
 
 class FastPath:

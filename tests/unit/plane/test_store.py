@@ -237,6 +237,35 @@ async def test_a_decision_is_known_before_it_is_committed(tmp_path: Path) -> Non
         store.change_soon("k", lambda _: _record("k"))
 
 
+async def test_a_decision_is_made_on_the_thread_that_asks(tmp_path: Path) -> None:
+    """`decide_now`: at once, and told of once it is committed; nothing is done where that cannot be."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    told: list[tuple[Record | None, Exception | None]] = []
+
+    def note(record: Record | None, error: Exception | None) -> None:
+        told.append((record, error))
+
+    def refuse(_: Record | None) -> Record:
+        raise ConflictError("moved on")
+
+    assert store.decide_now("k", lambda _: _record("k"), note) == _record("k")
+    store.wake()
+    assert await store.record("k") in (None, _record("k"))
+    await store.change("other", lambda _: _record("other"))  # after it
+    assert told == [(_record("k"), None)]
+    assert store.decide_now("k", lambda now: now, note) is None
+    with pytest.raises(ConflictError):
+        store.decide_now("k", refuse, note)
+    turn = asyncio.create_task(store.change("k", lambda _: _record("k", b"2", 2)))
+    await asyncio.sleep(0)
+    unsure = store.decide_now("k", lambda _: _record("k", b"3", 3), note)
+    assert await turn == _record("k", b"2", 2)
+    assert unsure is None or store.look("k") == (True, unsure)
+    await store.close()
+    with pytest.raises(RefusedError):
+        store.decide_now("k", lambda _: _record("k", b"4", 4), note)
+
+
 async def test_what_a_conflict_is_with_can_be_read(tmp_path: Path) -> None:
     """A decision that fails for a record on its way to the disk is told so when that record can be read."""
     store = await Store.open(tmp_path / "s.sqlite")
@@ -271,12 +300,24 @@ async def test_decisions_on_all_ways_follow_one_another(tmp_path: Path) -> None:
 
         store.change_then("k", up, told)
 
+    def at_once(done: asyncio.Future[None]) -> None:
+        def told(_: Record | None, error: Exception | None) -> None:
+            assert error is None
+            loop.call_soon_threadsafe(done.set_result, None)
+
+        if store.decide_now("k", up, told) is None:
+            store.change_then("k", up, told)
+        store.wake()
+
     waits: list[Awaitable[Any]] = []
     for number in range(120):
-        if number % 3 == 0:
-            waits += store.change_soon("k", up, durable=number % 2 == 0)
-        elif number % 3 == 1:
+        if number % 4 == 0:
+            waits += store.change_soon("k", up, durable=number % 8 == 0)
+        elif number % 4 == 1:
             waits.append(asyncio.create_task(store.change("k", up)))
+        elif number % 4 == 2:
+            waits.append(done := loop.create_future())
+            await asyncio.to_thread(at_once, done)
         else:
             waits.append(done := loop.create_future())
             await asyncio.to_thread(elsewhere, done)
