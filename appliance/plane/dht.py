@@ -7,7 +7,6 @@ the membership differ for a moment, or a partition) make concurrent versions, wh
 """
 
 import asyncio
-import contextlib
 import random
 import secrets
 import time
@@ -16,21 +15,20 @@ from functools import partial
 
 import structlog
 
-from appliance.errors import ConflictError, DeadlineError, RefusedError, SwiftbotError, UnreachableError
+from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
 from appliance.plane.absence import Absence
-from appliance.plane.fastpath import FastPath
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, StoreAsk, Written
+from appliance.plane.ordering import Ordering
 from appliance.plane.pulse import Pulse
 from appliance.plane.pushing import Pushing
 from appliance.plane.quorum.voting import Voting
 from appliance.plane.rpc import AtOnce, Rpc
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.settling import RETURNED_S, Settling
+from appliance.plane.settling import Settling
 from appliance.plane.store import Store
 from appliance.plane.versions import (
-    Behind,
     Record,
     Resolver,
     Write,
@@ -38,9 +36,6 @@ from appliance.plane.versions import (
     check_key,
     check_record,
     check_write,
-    decide,
-    descends,
-    follows_here,
     settle,
 )
 
@@ -89,15 +84,12 @@ class Dht:
         self.absence = Absence(replicas=config.replicas, whole=config.view == "full")
         self._pushing = Pushing(config, gateway=gateway, store=store, rpc=rpc, membership=membership, keep=self.keep)
         voting.learn = self._pushing.learn
-        self._unsaved: set[str] = set()
-        """Keys whose last decision here the replicas may have and the disk has not."""
-        self._fast = FastPath(
+        self.ordering = Ordering(
             config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
-            pushing=self._pushing, unsaved=self._unsaved, agree=self._agree,
+            pushing=self._pushing, keep=self.keep,
         )  # fmt: skip
-        self.on_ring_change.append(self._fast.ring_changed)
+        self.on_ring_change.append(self.ordering.fast.ring_changed)
         rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, direct=True, at_once=self._read_at_once)
-        rpc.register("dht_write", Write, self._on_write, exchange=False, direct=True, at_once=self._write_at_once)
         rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, direct=True, at_once=self._store_at_once)
         rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
         rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
@@ -223,7 +215,7 @@ class Dht:
             try:
                 (owner,) = await self._membership.holders(asked.key, 1)
                 if owner == self._gateway:
-                    return (await self._fast.write(asked) or await self._on_write(asked)).version
+                    return (await self.ordering.own(asked)).version
                 answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 # Dead, not yet known to be; or of another mind about who owns the key: both pass.
@@ -234,114 +226,6 @@ class Dht:
                 await asyncio.sleep(_AGAIN_S)
             else:
                 return answer.version
-
-    async def _on_write(self, asked: Write) -> Written:
-        """Order a write as the owner of its key, and have the replicas follow."""
-        check_write(asked, max_bytes=self._config.max_record_bytes)
-        if not self.owns(asked.key):
-            owner = self._membership.ring.owner(asked.key)
-            raise RefusedError(f"{asked.key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
-        await self.settling.until_mine(asked.key, returned_s=RETURNED_S)
-        if asked.key in self._unsaved:
-            await self._catch_up(asked.key)
-        try:
-            record, committed = await self._decide(asked)
-        except Behind:
-            await self._catch_up(asked.key)
-            try:
-                record, committed = await self._decide(asked)
-            except Behind:
-                raise ConflictError(
-                    f"{asked.key}: nobody here knows the version expected", remedy="read it and decide again"
-                ) from None
-        return Written(await self._replicate(record, asked, committed))
-
-    async def _decide(self, asked: Write) -> tuple[Record, asyncio.Future[Record | None]]:
-        """Decide as the owner; returns the record, and what ends when it is committed here."""
-
-        def order(current: Record | None) -> Record:
-            if self._pulse.doubtful:
-                raise RefusedError(f"{self._gateway} stood still and may have been succeeded", remedy="ask again")
-            return decide(current, asked, self._gateway)
-
-        decided, committed = self._store.change_soon(asked.key, order, durable=asked.durable)
-        record = await decided
-        if record is None:
-            raise SwiftbotError("a decision without a record")
-        return record, committed
-
-    async def _replicate(self, record: Record, asked: Write, committed: asyncio.Future[Record | None]) -> VersionVector:
-        """Have the other replicas store a record while this one commits it.
-
-        Returns:
-            Its version, once they and this gateway agree.
-        """
-        others = [each for each in self._replicas(record.key) if each != self._gateway]
-        pushes = [self._pushing.begin(each, record, durable=asked.durable) for each in others]
-        try:
-            await committed
-            # All are on their way: the slowest is what is waited for.
-            answers = [await each.done() for each in pushes]
-        except SwiftbotError:
-            # The replicas may have it: before the next decision on this key they are asked.
-            self._unsaved.add(record.key)
-            raise
-        finally:
-            for each in pushes:
-                each.end()
-        return await self._agree(record, asked, [answer for answer in answers if answer is not None])
-
-    async def _agree(self, record: Record, asked: Write, newer: list[Record]) -> VersionVector:
-        """The version that stands once replicas and this gateway agree; `newer`: what the former hold in its place."""
-        if newer:
-            newer = await self._not_from_here(newer, record)
-        if not newer:
-            return record.version
-        # A replica held a version that this owner had not seen: both now hold what `settle` made of the two.
-        for each in newer:
-            record = await self.keep(each)
-        if record.write != asked.write:
-            raise ConflictError(f"{record.key} was written elsewhere too", remedy="read it and decide again")
-        others = [each for each in self._replicas(record.key) if each != self._gateway]
-        await asyncio.gather(*(self._pushing.push(each, record) for each in others))
-        return record.version
-
-    async def _not_from_here(self, newer: list[Record], record: Record) -> list[Record]:
-        """Those of what replicas hold in place of a record that this gateway has not itself decided upon it since.
-
-        A later decision may overtake it on the way, one as a query, the other as a plain message: then this write is in
-        what the replica holds, and done. A writer that was told of a conflict would do it a second time.
-        """
-        known: list[Record | None] = []
-
-        def look(current: Record | None) -> None:
-            known.append(current)
-
-        await self._store.change(record.key, look)  # after every decision that was made by now
-        current = known[-1]
-        if current is None:
-            return newer
-        return [
-            each
-            for each in newer
-            if not (descends(current.version, each.version) and follows_here(each, record, self._gateway))
-        ]
-
-    async def _catch_up(self, key: str) -> None:
-        """Ask every other replica for its version: the writer has seen one newer than ours."""
-
-        async def ask(gateway: str) -> None:
-            with contextlib.suppress(SwiftbotError):
-                found = await self._rpc.call(
-                    gateway, "dht_read", KeyAsk(key), Found, timeout_s=self._config.replica_timeout_s
-                )
-                if found.record is not None:
-                    await self.keep(found.record)
-
-        # One more than the replicas: the owner before the last change of membership may hold it.
-        near = self._membership.ring.successors(key, self._config.replicas + 1)
-        await asyncio.gather(*(ask(each) for each in near if each != self._gateway))
-        self._unsaved.discard(key)
 
     # --- answering --------------------------------------------------------------------------------------------
 
@@ -378,10 +262,6 @@ class Dht:
         if record is not None:
             answer(Found(record))
         return record is not None
-
-    def _write_at_once(self, asked: Write, answer: AtOnce) -> bool:
-        """Order an ordinary write on Zenoh's thread."""
-        return self._fast.order(check_write(asked, max_bytes=self._config.max_record_bytes), answer)
 
     def _store_at_once(self, asked: StoreAsk, answer: AtOnce) -> bool:
         """Have the store's thread keep a record and answer, without a turn of the event loop."""
@@ -422,12 +302,9 @@ class Dht:
         check_write(write, max_bytes=self._config.max_record_bytes)
         return Written(await (self._voting.write(write) if asked.quorum else self._write(write)))
 
-    def _replicas(self, key: str) -> tuple[str, ...]:
-        return self._membership.ring.successors(key, self._config.replicas)
-
     async def close(self) -> None:
         """Give up what is still being written and pushed."""
-        await self._fast.close()
+        await self.ordering.fast.close()
         await self._pushing.close()
 
 

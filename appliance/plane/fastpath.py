@@ -7,8 +7,8 @@ this gateway on the event loop's; the copies go out at once, and what Zenoh's th
 (`Copies`).
 
 Only the ordinary: the ring is known whole, the key is this gateway's and compared, the record's state is in memory, all
-replicas are known to listen. Whatever else it is, the event loop does it (`dht`), and whatever is not as it should be
-afterwards it mends: a replica that is late, gone, fails, or holds something else, or a commit that failed.
+replicas are known to listen. Whatever else there is the event loop does (`ordering`), and whatever is not as it should
+be afterwards it mends: a replica that is late, gone, fails, or holds something else, or a commit that failed.
 """
 
 import asyncio
@@ -23,6 +23,7 @@ import structlog
 
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector, encode
+from appliance.plane.lately import Lately
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, StoreAsk, Written
 from appliance.plane.pulse import Pulse
@@ -144,6 +145,7 @@ class FastPath:
         pulse: Pulse,
         pushing: Pushing,
         unsaved: set[str],
+        lately: Lately,
         agree: Callable[[Record, Write, list[Record]], Awaitable[VersionVector]],
     ) -> None:
         self._config = config
@@ -155,6 +157,7 @@ class FastPath:
         self._pulse = pulse
         self._pushing = pushing
         self._unsaved = unsaved
+        self._lately = lately
         self._agree = agree
         self._loop = asyncio.get_running_loop()
         self._under_way: set[Copies] = set()
@@ -215,6 +218,7 @@ class FastPath:
         if record is None:
             return None
         copies.record = record
+        self._lately.began(key, asked.write)
         self._under_way.add(copies)
         payload = encode(StoreAsk(record, asked.durable))
         for replica, way in zip(others, ways, strict=True):
@@ -260,6 +264,7 @@ class FastPath:
         self._under_way.discard(copies)
         record = copies.record
         if copies.stored and record is not None:
+            self._lately.ended(record.key, copies.asked.write, record.version)
             copies.answer(Written(record.version))
             return
         if copies.problem is not None:
@@ -278,18 +283,23 @@ class FastPath:
         """Do what an unusual end asks for, and tell whoever asked."""
         for number in copies.numbers:
             self._rpc.forget(number)
-        outcome: Written | SwiftbotError
+        asked = copies.asked
         try:
-            outcome = Written(await self._mended(copies))
+            version = await self._mended(copies)
         except SwiftbotError as error:
-            outcome = error
+            problem = error
         except asyncio.CancelledError:
             copies.answer(_STOPPING)
             raise
         except Exception as defect:  # supervision boundary: whoever asked must hear of it
-            log.exception("a write could not be ended", key=copies.asked.key)
-            outcome = SwiftbotError(f"{type(defect).__name__}: {defect}")
-        copies.answer(outcome)
+            log.exception("a write could not be ended", key=asked.key)
+            problem = SwiftbotError(f"{type(defect).__name__}: {defect}")
+        else:
+            self._lately.ended(asked.key, asked.write, version)
+            copies.answer(Written(version))
+            return
+        self._lately.failed(asked.key, asked.write)
+        copies.answer(problem)
 
     async def _mended(self, copies: Copies) -> VersionVector:
         record = copies.record

@@ -266,7 +266,7 @@ async def test_a_gateway_that_stood_still_orders_nothing_until_it_knows(fleet: F
     pulse._until = float("inf")
     stale = Write(key=key, value=b"stale", expected=version, write="stale")
     with pytest.raises(RefusedError, match="stood still"):
-        await plane.dht._on_write(stale)
+        await plane.dht.ordering.order(stale)
     writing = asyncio.create_task(fleet.planes[0].dht.write(key, b"next", expected=missed.version))
     with pytest.raises(TimeoutError):
         await asyncio.wait_for(asyncio.shield(writing), 0.2)

@@ -76,6 +76,7 @@ async def test_a_write_that_a_later_one_overtakes_is_done(fleet: Fleet, monkeypa
         return Late(gateway, record) if record.value == b"first" else begin(gateway, record, durable=durable)
 
     monkeypatch.setattr(owner.dht._pushing, "begin", push)
+    monkeypatch.setattr(owner.rpc, "known_way", lambda *_: None)  # none is ordered in place
     writing = asyncio.create_task(owner.dht.write(key, b"first", expected=None))
     while (first := await fleet.planes[0].dht.read(key)) is None:
         await asyncio.sleep(0.01)
@@ -262,7 +263,7 @@ async def test_a_write_meant_for_another_is_refused(fleet: Fleet) -> None:
     """A gateway that does not own a key does not order its writes: it names the owner."""
     key = fleet.owned_by(1)
     with pytest.raises(SwiftbotError, match="belongs to g1"):
-        await fleet.planes[0].dht._on_write(Write(key=key, value=b"", write="w"))
+        await fleet.planes[0].dht.ordering.order(Write(key=key, value=b"", write="w"))
 
 
 async def test_a_fleet_that_cannot_be_written_to_says_so(fleet: Fleet) -> None:
