@@ -212,14 +212,14 @@ class FastPath:
             return None
         copies = Copies(asked, tuple(others), self._ended, answer)
         try:
-            record = self._store.decide_now(key, partial(self._decide, asked), copies.committed, durable=asked.durable)
+            record = self._store.decide_now(key, partial(self._decide, copies), copies.committed, durable=asked.durable)
         except (SwiftbotError, Behind):
-            return None  # whoever asked is told why by the event loop, which looks again
+            record = None  # whoever asked is told why by the event loop, which looks again
         if record is None:
+            if copies in self._under_way:  # it was decided and could not be queued
+                self._under_way.discard(copies)
+                self._lately.failed(key, asked.write)
             return None
-        copies.record = record
-        self._lately.began(key, asked.write)
-        self._under_way.add(copies)
         payload = encode(StoreAsk(record, asked.durable))
         for replica, way in zip(others, ways, strict=True):
             heard = partial(copies.heard, replica)
@@ -230,12 +230,25 @@ class FastPath:
                 copies.numbers.append(number)
         # Only now: the store's thread wants the interpreter too.
         self._store.wake()
+        if copies.over:
+            self._forget(copies)  # those that were sent after it had ended
         return copies
 
-    def _decide(self, asked: Write, current: Record | None) -> Record:
+    def _forget(self, copies: Copies) -> None:
+        for number in copies.numbers:
+            self._rpc.forget(number)
+
+    def _decide(self, copies: Copies, current: Record | None) -> Record:
         if self._pulse.doubtful:
             raise RefusedError(f"{self._gateway} stood still and may have been succeeded", remedy="ask again")
-        return decide(current, asked, self._gateway)
+        asked = copies.asked
+        record = decide(current, asked, self._gateway)
+        if record is not current:
+            # Before the store has it: where nobody else has a copy its commit may end it on the spot.
+            copies.record = record
+            self._lately.began(asked.key, asked.write)
+            self._under_way.add(copies)
+        return record
 
     # --- ways -------------------------------------------------------------------------------------------------
 
@@ -281,8 +294,7 @@ class FastPath:
 
     async def _mend(self, copies: Copies) -> None:
         """Do what an unusual end asks for, and tell whoever asked."""
-        for number in copies.numbers:
-            self._rpc.forget(number)
+        self._forget(copies)
         asked = copies.asked
         try:
             version = await self._mended(copies)

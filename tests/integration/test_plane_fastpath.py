@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import sqlite3
 import threading
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,29 @@ async def test_writes_are_ordered_where_they_come(fleet: Fleet, monkeypatch: pyt
     await other.dht.remove(key, expected=version)
     assert await other.dht.read(key) is None
     assert not owner.dht.ordering.fast._under_way
+
+
+async def test_a_gateway_alone_keeps_nothing_of_what_is_done(
+    tmp_path: Path, free_ports: Callable[..., list[int]]
+) -> None:
+    """Nobody else has a copy, so that a commit ends a write on the spot, before its order has returned."""
+    async with fleet_of(tmp_path, free_ports(1)) as fleet:
+        plane = await fleet.start(0)
+        await fleet.settled()
+        decide_now = plane.store.decide_now
+
+        def slow(*args: Any, **kwargs: Any) -> Record | None:
+            record = decide_now(*args, **kwargs)
+            plane.store.wake()
+            time.sleep(0.02)
+            return record
+
+        plane.store.decide_now = slow
+        for number in range(5):
+            asked = Write(key=f"task/{number}", value=b"1", write="w")
+            assert await plane.dht._write(asked) == {"g0": 1}
+            assert plane.dht.ordering._lately.of(asked.key, "w") == (True, {"g0": 1})
+        assert not plane.dht.ordering.fast._under_way
 
 
 async def test_what_is_not_ordinary_goes_by_the_loop(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
