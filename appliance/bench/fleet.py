@@ -6,15 +6,14 @@ back over Zenoh, so a search for a container, both hops and the way back are in 
 
 import asyncio
 import secrets
-import tempfile
 import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
-from pathlib import Path
 
 from appliance import local_fleet
 from appliance.bench.load import Arrival, Outcome
 from appliance.bench.pooled import SKILL, fleet_name, need_of, write_skill
+from appliance.bench.workspace import workspace
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
@@ -31,11 +30,11 @@ async def running(
     pools: dict[str, PoolConfig], *, image: str, progress: Progress
 ) -> AsyncGenerator[tuple[FleetState, "Orders"]]:
     """A fleet with these pools (gateways `gw-1`, `gw-2`, ... in order) and a way to order; all gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
-        skills = write_skill(Path(folder), image)
+    with workspace() as folder:
+        skills = write_skill(folder, image)
         order = Order(
             fleet=fleet_name(),
-            directory=Path(folder) / "fleet",
+            directory=folder / "fleet",
             gateways=len(pools),
             mavlink=0,
             zenoh=0,

@@ -14,7 +14,8 @@ import structlog
 
 log = structlog.get_logger(__name__)
 
-_FIRST = 512 * 1024
+_FIRST = 4352 * 1024
+"""As much as SQLite appends before it begins anew: some 1,000 pages with their headers."""
 _STEP = 128 * 1024
 """At a time, between two commits: half a millisecond."""
 _MOST = 8 * 2**20

@@ -8,10 +8,8 @@ beside it.
 
 import asyncio
 import signal
-import tempfile
 import time
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -21,6 +19,7 @@ from appliance.bench.chaos.arena import Arena, Progress, loopback
 from appliance.bench.failover.logs import LogTail
 from appliance.bench.figures import summary
 from appliance.bench.pooled import fleet_name
+from appliance.bench.workspace import workspace
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
@@ -54,12 +53,12 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
         `own`: ms after the session was open, on the gateway's own clock; `seen`: as another gateway has it; `process`:
         ms after the process was started.
     """
-    with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
+    with workspace() as folder:
         base = GatewayConfig(
             id="gw-1", llm=LlmConfig(tiers=("rules",)), plane=PlaneConfig(lease_ms=options.lease_ms), drain_s=5.0
         )
         arena = Arena(
-            fleet=fleet_name(), directory=Path(folder), sites=loopback(options.gateways), base=base,
+            fleet=fleet_name(), directory=folder, sites=loopback(options.gateways), base=base,
             pool=PoolConfig(mode="cold", floor={}, capacity=1),
         )  # fmt: skip
         try:

@@ -12,11 +12,9 @@ same record once they have met.
 
 import asyncio
 import signal
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -25,6 +23,7 @@ from appliance.bench.chaos.arena import Arena, Progress, loopback
 from appliance.bench.failover.logs import LOOK_S, LogTail, wall_s
 from appliance.bench.figures import summary
 from appliance.bench.pooled import SKILL, fleet_name, write_skill
+from appliance.bench.workspace import workspace
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError
@@ -216,13 +215,13 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
         counts of tasks.
     """
     result: dict[str, Any] = {"gateways": options.gateways, "lease_ms": options.lease_ms, "goal_ms": GOAL_MS}
-    with tempfile.TemporaryDirectory(prefix="swiftbot-bench-") as folder:
-        skills = write_skill(Path(folder), options.image, more=_PARAMETER)
+    with workspace() as folder:
+        skills = write_skill(folder, options.image, more=_PARAMETER)
         base = GatewayConfig(
             id="gw-1", llm=LlmConfig(tiers=("rules",)), plane=PlaneConfig(lease_ms=options.lease_ms), drain_s=5.0
         )
         arena = Arena(
-            fleet=fleet_name(), directory=Path(folder) / "fleet", sites=loopback(options.gateways), base=base,
+            fleet=fleet_name(), directory=folder / "fleet", sites=loopback(options.gateways), base=base,
             pool=PoolConfig(floor={options.image: 1}, capacity=3), skills=skills,
         )  # fmt: skip
         try:
