@@ -38,6 +38,8 @@ class Membership:
         """Name -> keys of the tokens seen."""
         self._since: dict[str, float] = {}
         """Name -> since when a token of it has been seen without a break, by the pulse's clock."""
+        self._gone: dict[str, float] = {}
+        """Name -> when the last token of it went, by the pulse's clock, of those that have not come back; the last."""
         self._watches: list[Closer] = []
         self._token: Closer | None = None
         self._again: Closer | None = None
@@ -70,6 +72,10 @@ class Membership:
     def seen_since(self, moment: float) -> frozenset[str]:
         """The other members whose token was there at a moment of the pulse's clock and has never gone since."""
         return frozenset(name for name, at in self._since.items() if at <= moment)
+
+    def lost_since(self, moment: float) -> frozenset[str]:
+        """Those whose last token went after a moment of the pulse's clock, and who have not come back."""
+        return frozenset(name for name, at in self._gone.items() if at >= moment)
 
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
@@ -121,10 +127,14 @@ class Membership:
         if alive and len(self._members) >= MOST:
             self._session.refuse("too many gateways", key=key)
             return
+        self._gone.pop(name, None)
         if alive:
             self._tokens[name], self._since[name] = {key}, clock()
         else:
             self._since.pop(name, None)
+            self._gone[name] = clock()
+            while len(self._gone) > MOST:
+                del self._gone[next(iter(self._gone))]
         self._members = self._members | {name} if alive else self._members - {name}
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
         self._tell(self.on_joined if alive else self.on_lost, name)

@@ -81,6 +81,7 @@ class Plane:
                 lease_s=config.lease_ms / 1e3,
                 members=self._membership,
                 answers=self._answers,
+                sees=self._sees,
                 renew=session.renew_links,
             )
         self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
@@ -250,6 +251,13 @@ class Plane:
         except SwiftbotError as error:
             return not isinstance(error, UnreachableError | DeadlineError)
         return True
+
+    async def _sees(self, name: str, other: str, timeout_s: float) -> bool:
+        """Whether a member says in time that it sees another."""
+        ask = MemberAsk(gateway=other)
+        with contextlib.suppress(SwiftbotError):
+            return (await self.rpc.call(name, "member", ask, Member, timeout_s=timeout_s)).here
+        return False
 
     async def _on_member(self, ask: MemberAsk) -> Member:
         return Member(here=check_name(ask.gateway, "gateway") in self._membership.members)
