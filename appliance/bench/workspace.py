@@ -13,9 +13,9 @@ def workspace(prefix: str = "swiftbot-bench-") -> Generator[Path]:
     folder = Path(tempfile.mkdtemp(prefix=prefix))
     try:
         yield folder
-    except Exception:
+    except Exception:  # the folder stays: the error names the logs in it
         raise
-    except BaseException:
+    except BaseException:  # given up by whoever started it
         shutil.rmtree(folder, ignore_errors=True)
         raise
     else:

@@ -201,8 +201,10 @@ class Direct:
         """Do the same from any thread; both callbacks come on Zenoh's, and must not wait.
 
         Returns:
-            The question's number; None: nobody listens any more, or it could not be sent.
+            The question's number; None: nobody listens any more, it is too large for a message, or could not be sent.
         """
+        if len(payload) > link.MOST_DIRECT:
+            return None
         number = next(self._numbers)
         self._waiting[number] = _Waiting(way, on_reply, on_gone, here=True)
         if way.listened:

@@ -111,8 +111,10 @@ class Copies:
     def abandon(self, error: SwiftbotError) -> bool:
         """Count nothing any more; whether this is what ended it, and whoever asked is still to be told."""
         with self._lock:
-            ended, self.over, self.problem = not self.over, True, error
-        return ended
+            if self.over:
+                return False
+            self.over, self.problem = True, error
+        return True
 
     def _finish(self) -> bool:
         if self.over or not self._committed or (self._missing and self.problem is None):
@@ -220,16 +222,18 @@ class FastPath:
                 self._under_way.discard(copies)
                 self._lately.failed(key, asked.write)
             return None
-        payload = encode(StoreAsk(record, asked.durable))
-        for replica, way in zip(others, ways, strict=True):
-            heard = partial(copies.heard, replica)
-            number = None if way is None else self._rpc.ask_here(way, replica, "dht_store", payload, heard)
-            if number is None:
-                copies.heard(replica, b"")
-            else:
-                copies.numbers.append(number)
-        # Only now: the store's thread wants the interpreter too.
-        self._store.wake()
+        try:
+            payload = encode(StoreAsk(record, asked.durable))
+            for replica, way in zip(others, ways, strict=True):
+                heard = partial(copies.heard, replica)
+                number = None if way is None else self._rpc.ask_here(way, replica, "dht_store", payload, heard)
+                if number is None:
+                    copies.heard(replica, b"")
+                else:
+                    copies.numbers.append(number)
+        finally:
+            # Only now: the store's thread wants the interpreter too. What was decided is committed, whatever happens.
+            self._store.wake()
         if copies.over:
             self._forget(copies)  # those that were sent after it had ended
         return copies

@@ -121,6 +121,18 @@ async def test_what_is_not_ordinary_goes_by_the_loop(fleet: Fleet, monkeypatch: 
     assert len(threads) == 2
 
 
+async def test_a_copy_that_is_too_large_for_a_message_is_there_as_well(fleet: Fleet) -> None:
+    """Many have written the record, and their names make its copies large: they go as queries, before it is done."""
+    owner, key = fleet.planes[1], fleet.owned_by(1)
+    version = {f"{'w' * 58}{number:03}": 1 for number in range(200)}
+    for plane in fleet.planes.values():
+        await plane.dht.keep(Record(key=key, value=b"0", version=version, write="theirs"))
+    value = b"x" * 15_000
+    assert await owner.dht.write(key, value, expected=version) == version | {"g1": 1}
+    assert await _copies(fleet, key) == [value] * 3
+    assert not owner.session.refused
+
+
 @pytest.mark.parametrize("value", [b"1", b"x" * 30_000])
 async def test_a_write_that_is_asked_for_again_is_done_once(fleet: Fleet, value: bytes) -> None:
     """Its answer was lost, another's write followed: asked again it is told as done, with the version that it made."""
