@@ -54,6 +54,11 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     record: RecordConfig = field(default_factory=RecordConfig)
     tasks: TasksConfig = field(default_factory=TasksConfig)
 
+    def endpoints(self) -> tuple[str, ...]:
+        """Where this gateway and the others are reached, by its configuration, each once."""
+        others = (endpoint for name, endpoint in self.plane.peers.items() if name != self.id)
+        return tuple(dict.fromkeys((*self.plane.listen, *self.plane.connect, *others)))
+
 
 def load(path: Path) -> GatewayConfig:
     """Read a configuration file.

@@ -249,7 +249,7 @@ class _Starting:
             site=self._order.site,
             plane=PlaneConfig(
                 listen=(endpoints[index],),
-                connect=tuple(endpoint for at, endpoint in enumerate(endpoints) if at != index),
+                peers=dict(zip(names, endpoints, strict=True)),
                 voters=names,
             ),
             pool=self._order.pool_of(name),

@@ -46,7 +46,7 @@ site = "/etc/swiftbot/site.toml"
 
 [plane]
 listen = ["tcp/0.0.0.0:7447"]
-connect = ["tcp/gw-2.example:7447"]
+peers = {gw-1 = "tcp/gw-1.example:7447", gw-2 = "tcp/gw-2.example:7447"}   # the same in each gateway
 
 [pool]
 capacity = 8

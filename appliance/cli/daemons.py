@@ -94,7 +94,7 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
         told = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
         logs.configure(level=loaded.log_level, style=loaded.log_format)
         fleet, settings = loaded.fleet, loaded.record
-        connect = (*loaded.plane.listen, *loaded.plane.connect)
+        connect = loaded.endpoints()
     else:
         endpoint = where.endpoint()
         fleet, connect, settings = endpoint.fleet, endpoint.connect, RecordConfig(directory=str(Path.cwd()))
@@ -140,7 +140,7 @@ def foxglove(
         loaded = configuration.load(config)
         logs.configure(level=loaded.log_level, style=loaded.log_format)
         told = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
-        fleet, connect = loaded.fleet, (*loaded.plane.listen, *loaded.plane.connect)
+        fleet, connect = loaded.fleet, loaded.endpoints()
     else:
         endpoint = where.endpoint()
         fleet, connect = endpoint.fleet, endpoint.connect

@@ -16,6 +16,7 @@ import zenoh
 
 from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError, from_code
 from appliance.model import ErrorReply, encode
+from appliance.plane import dialling
 from appliance.plane.settings import PlaneConfig
 
 log = structlog.get_logger(__name__)
@@ -24,10 +25,10 @@ _WIRE_HEADROOM = 8
 """Zenoh itself drops messages of more than so many times the largest payload, before they are whole in memory."""
 
 
-def open_raw(config: PlaneConfig) -> zenoh.Session:
-    """Open a session; blocks. Errors as `Session.open`."""
+def open_raw(config: PlaneConfig, gateway: str = "") -> zenoh.Session:
+    """Open a session, that of a gateway where it is named; blocks. Errors as `Session.open`."""
     try:
-        return zenoh.open(_zenoh_config(config))
+        return zenoh.open(_zenoh_config(config, gateway))
     except zenoh.ZError as error:
         raise _open_error(config, str(error)) from error
 
@@ -132,7 +133,7 @@ def error_from(text: bytes) -> SwiftbotError:
     return rebuilt
 
 
-def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
+def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
     """Zenoh's own configuration; design/platform has the measurements behind it."""
     client = config.mode == "client"
     settings: dict[str, Any] = {
@@ -140,15 +141,16 @@ def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
         "listen/endpoints": list(config.listen),
         "listen/exit_on_failure": True,
         "listen/timeout_ms": 0,
-        "connect/endpoints": list(config.connect),
+        "connect/endpoints": [*config.connect, *dialling.dialled(gateway, config.peers)],
         # Peers look for each other for ever in the background, so gateways may start in any order.
         "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
         "connect/exit_on_failure": client,
-        # A recorder misses what a restarted gateway says while it is not linked with it again: up after 0.3 s.
+        # One that is restarted waits to be dialled by those above it, and a recorder misses what it says meanwhile: so
+        # each pause is 5 ms and a fiftieth of the time that it has been away, up to 0.2 s.
         "connect/retry": {
-            "period_init_ms": 50,
+            "period_init_ms": 50 if client else 5,
             "period_max_ms": 1000 if client else 200,
-            "period_increase_factor": 1.5,
+            "period_increase_factor": 1.5 if client else 1.02,
         },
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
@@ -170,6 +172,10 @@ def _zenoh_config(config: PlaneConfig) -> zenoh.Config:
         "transport/unicast/open_timeout": 3000,
         "transport/unicast/accept_timeout": 3000,
     }
+    if config.mode == "peer" and config.listen:
+        settings["id"] = dialling.session_id(gateway, naming=bool(config.connect) and not config.peers)
+        # Nobody can dial a peer that does not listen: that one dials all.
+        settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
     made = zenoh.Config()
     for key, value in settings.items():
         made.insert_json5(key, msgspec.json.encode(value).decode())

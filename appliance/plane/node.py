@@ -140,7 +140,7 @@ class Plane:
         """
         check_name(gateway, "gateway")
         away_s = _unwritten_s(data_dir / STORE_FILE)
-        session, opened, store = await _open_both(config, fleet, data_dir / STORE_FILE)
+        session, opened, store = await _open_both(config, fleet, gateway, data_dir / STORE_FILE)
         plane: Plane | None = None
         try:
             plane = cls(config, session=session, store=store, gateway=gateway)
@@ -185,7 +185,7 @@ class Plane:
     async def _join(self) -> None:
         membership = self._membership
         await self._voting.voter.start(lost=self.store.set_aside is not None)
-        if self.config.connect:
+        if self.config.connect or set(self.config.peers) - {self.gateway}:
             await self._first_link()
         self._reached("linked")
         present = await self._present()
@@ -321,11 +321,11 @@ def _unwritten_s(path: Path) -> float:
     return max(0.0, time.time() - max(written)) if written else math.inf
 
 
-async def _open_both(config: PlaneConfig, fleet: str, path: Path) -> tuple[Session, float, Store]:
+async def _open_both(config: PlaneConfig, fleet: str, gateway: str, path: Path) -> tuple[Session, float, Store]:
     """Open session and store at the same time; returns when the session was open too. Errors as `Plane.open`."""
     storing = asyncio.create_task(Store.open(path), name="open the store")
     try:
-        session = await Session.open(config, fleet)
+        session = await Session.open(config, fleet, gateway)
     except BaseException:
         with contextlib.suppress(SwiftbotError):
             await (await storing).close()

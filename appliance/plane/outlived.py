@@ -120,6 +120,8 @@ class Outlived:
             if apart := await self._apart(since):
                 log.warning("members that were lost in a standstill are there and do not come back", members=apart)
                 self._renew("others see members that did not come back")
+                # They link anew just then: none is silent for that reason.
+                await self._pause(self._lease_s * PAUSE_LEASES)
             if not silent and not apart:
                 return
 

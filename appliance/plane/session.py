@@ -69,8 +69,10 @@ class Session:
         self.renew_links = doors.renew
 
     @classmethod
-    async def open(cls, config: PlaneConfig, fleet: str) -> "Session":
+    async def open(cls, config: PlaneConfig, fleet: str, gateway: str = "") -> "Session":
         """Open a session as configured. Peers start in any order and keep looking for each other for ever.
+
+        `gateway`: whose it is, where it is one's: which of two dials the other goes by their names.
 
         Raises:
             ConfigError: a setting is wrong, or an endpoint to listen on is in use or not of this machine.
@@ -78,7 +80,7 @@ class Session:
         """
         config.check()
         Keys(fleet)
-        raw = await asyncio.to_thread(link.open_raw, config)
+        raw = await asyncio.to_thread(link.open_raw, config, gateway)
         return cls(config, fleet, raw, asyncio.get_running_loop())
 
     @property

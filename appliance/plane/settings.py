@@ -3,7 +3,7 @@
 from typing import Literal
 from urllib.parse import urlsplit
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from appliance.errors import ConfigError, PayloadError
 from appliance.plane.keys import check_name
@@ -20,8 +20,13 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     listen: tuple[str, ...] = ()
     """Endpoints to accept links on, such as `tcp/0.0.0.0:7447`; empty: accept none."""
     connect: tuple[str, ...] = ()
-    """Endpoints to keep linked to. Name every gateway you know: gossip finds the others, but a single cut link is
-    redialled only where it is named."""
+    """Endpoints to keep linked to: of routers, or of gateways that do not name this one. Gossip finds the others, but a
+    single cut link is redialled only where it is named. Gateways that name each other belong into `peers` instead."""
+    peers: dict[str, str] = field(default_factory=dict[str, str])
+    """All gateways of a fleet of peers, by name: the endpoint under which the others reach each, as in
+    `{gw-1 = "tcp/10.0.0.1:7447", gw-2 = "tcp/10.0.0.2:7447"}`. The same table in each of them: of each two, one dials
+    the other, so that a standstill of either cannot mix up two links between them. A new gateway whose name the others
+    do not have yet names some of them in `connect`."""
     replicas: int = 3
     """Copies of a record, the owner's among them: two gateways may die at once without losing one (design: r = 3)."""
     virtual_nodes: int = 32
@@ -68,7 +73,8 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def check(self) -> None:
         """Raise ConfigError when a setting cannot work."""
-        for name, endpoints in (("listen", self.listen), ("connect", self.connect)):
+        peers = tuple(self.peers.values())
+        for name, endpoints in (("listen", self.listen), ("connect", self.connect), ("peers", peers)):
             for endpoint in endpoints:
                 protocol, slash, address = endpoint.partition("/")
                 if not slash or protocol not in _PROTOCOLS or not address:
@@ -83,6 +89,7 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             raise ConfigError(
                 "plane.listen is set, but a client accepts no links", remedy="empty it, or set plane.mode to peer"
             )
+        self._check_peers()
         if self.view != "full" and self.view < max(16, 4 * self.replicas):
             raise ConfigError(
                 f"plane.view is {self.view}",
@@ -104,6 +111,26 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 f"{self.max_payload_bytes:,} once encoded",
                 remedy="keep it under 0.7 of max_payload_bytes",
             )
+
+    def _check_peers(self) -> None:
+        if not self.peers:
+            return
+        for name in self.peers:
+            try:
+                check_name(name, "gateway")
+            except PayloadError as error:
+                raise ConfigError(f"plane.peers: {error}", remedy="name gateways by their ids") from error
+        if self.mode != "peer":
+            raise ConfigError(
+                f"plane.peers is set, but plane.mode is {self.mode}", remedy="name routers or gateways in plane.connect"
+            )
+        if not self.listen:
+            raise ConfigError(
+                "plane.peers is set, but plane.listen is empty",
+                remedy="some of them dial this one: listen on the endpoint that its own entry names",
+            )
+        if len(set(self.peers.values())) < len(self.peers):
+            raise ConfigError("plane.peers has an endpoint twice", remedy="each gateway has one of its own")
 
 
 _LEAST: dict[str, float] = {

@@ -1,4 +1,4 @@
-"""The plane between processes of their own: a gateway killed with SIGKILL, and one that is frozen."""
+"""The plane between processes of their own: gateways killed with SIGKILL, and frozen."""
 
 import asyncio
 import json
@@ -14,15 +14,21 @@ pytestmark = pytest.mark.anyio
 
 GATEWAY = """
 import asyncio, base64, json, sys
+from collections import Counter
 from pathlib import Path
 from appliance.errors import SwiftbotError
-from appliance.plane.node import Plane
+from appliance.plane.node import Member, MemberAsk, Plane
 from appliance.plane.settings import PlaneConfig
 
 async def main():
     number, folder, *endpoints = int(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:]
-    others = tuple(each for each in endpoints if each != endpoints[number])
-    config = PlaneConfig(listen=(endpoints[number],), connect=others)
+    peers = {f"g{number}": each for number, each in enumerate(endpoints)}
+    if number in (1, 2):  # the tables of these two lack each other
+        del peers[f"g{3 - number}"]
+    if number < len(endpoints):
+        config = PlaneConfig(listen=(endpoints[number],), peers=peers, lease_ms=LEASE_MS)
+    else:  # a newcomer that the others have not been told of
+        config = PlaneConfig(listen=("tcp/127.0.0.1:0",), connect=tuple(endpoints[:1]), lease_ms=LEASE_MS)
     plane = await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=folder / f"g{number}")
     print(json.dumps("open"), flush=True)
     reader = asyncio.StreamReader()
@@ -37,6 +43,14 @@ async def main():
                 answer = None if record is None else [record.value.decode(), record.version]
             elif ask["do"] == "state":
                 answer = [sorted(plane.members()), plane.dht.settling.reconciled(), plane.ring.owner(ask["key"])]
+            elif ask["do"] == "hello":
+                asked = MemberAsk(gateway=plane.gateway)
+                others = sorted(plane.members() - {plane.gateway})
+                calls = (plane.rpc.call(each, "member", asked, Member) for each in others)
+                said = await asyncio.gather(*calls, return_exceptions=True)
+                seen = [each for each, answer in zip(others, said) if isinstance(answer, Member) and answer.here]
+                links = Counter(str(each.zid) for each in plane.session._wire.raw.info.links())
+                answer = [seen, sorted(links.values())]
         except SwiftbotError as error:
             answer = {"error": error.code}
         print(json.dumps(answer), flush=True)
@@ -70,16 +84,17 @@ class Gateway:
 
 
 class Fleet:
-    """Three gateway processes."""
+    """Gateway processes that name each other in `peers`."""
 
-    def __init__(self, folder: Path, endpoints: list[str]) -> None:
+    def __init__(self, folder: Path, endpoints: list[str], *, lease_ms: int = 1000) -> None:
         self.folder, self.endpoints = folder, endpoints
+        self.script = GATEWAY.replace("LEASE_MS", str(lease_ms))
         self.gateways: dict[int, Gateway] = {}
 
     async def start(self, number: int) -> None:
         """Start one and wait until it is open."""
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", GATEWAY, str(number), str(self.folder), *self.endpoints,
+            sys.executable, "-c", self.script, str(number), str(self.folder), *self.endpoints,
             stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
         )  # fmt: skip
         self.gateways[number] = Gateway(process)
@@ -105,6 +120,11 @@ class Fleet:
         process.kill()
         await process.wait()
 
+    async def end(self) -> None:
+        """SIGKILL all, the frozen ones too."""
+        for number in list(self.gateways):
+            await self.kill(number)
+
 
 @pytest.fixture
 async def fleet(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncIterator[Fleet]:
@@ -116,9 +136,7 @@ async def fleet(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncIt
         await made.settled()
         yield made
     finally:
-        for number in list(made.gateways):
-            made.gateways[number].process.send_signal(signal.SIGCONT)
-            await made.kill(number)
+        await made.end()
 
 
 async def test_the_owner_is_killed(fleet: Fleet) -> None:
@@ -180,3 +198,28 @@ async def test_a_frozen_owner_is_replaced_and_comes_back(fleet: Fleet) -> None:
         fleet.gateways[2] = frozen
     await fleet.settled()
     assert await frozen.ask("read", key=key) == ["after", newer]
+
+
+@pytest.mark.timeout(180)
+async def test_a_standstill_mixes_up_no_links(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """Each gateway in turn stands still for a lease and more: then each two have one link again, and each is answered.
+
+    One of the five is a newcomer that the others do not name, and two are not in each other's tables.
+    """
+    made = Fleet(tmp_path, [f"tcp/127.0.0.1:{port}" for port in free_ports(4)], lease_ms=500)
+    try:
+        for number in (3, 0, 1, 2, 4):
+            await made.start(number)
+        await made.settled()
+        for turn in range(10):
+            process = made.gateways[turn % 5].process
+            process.send_signal(signal.SIGSTOP)
+            await asyncio.sleep((0.7, 1.0, 1.5)[turn % 3])
+            process.send_signal(signal.SIGCONT)
+            await asyncio.sleep(0.5)  # a lease
+            await made.settled()
+            for number, gateway in made.gateways.items():
+                others = [f"g{each}" for each in range(5) if each != number]
+                assert await gateway.ask("hello") == [others, [1, 1, 1, 1]], f"of g{number}, after turn {turn}"
+    finally:
+        await made.end()

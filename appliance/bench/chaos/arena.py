@@ -98,7 +98,7 @@ class Arena:
                 plane=replace(
                     self._base.plane,
                     listen=(site.endpoint,),
-                    connect=tuple(each for each in self.endpoints if each != site.endpoint),
+                    peers={each: at.endpoint for each, at in self.sites.items()},
                 ),
                 pool=self._pool,
                 record=RecordConfig(directory=str(self.record_dir)),
