@@ -88,6 +88,8 @@ def check(config: GatewayConfig, source: str) -> None:
     try:
         check_name(config.id, "id")
         check_name(config.fleet, "fleet")
+        config.plane.check()
+        config.plane.check_own(config.id)
         config.robots.check()
         config.record.check()
         config.llm.check()

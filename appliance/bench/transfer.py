@@ -88,7 +88,8 @@ async def _gateway(
 ) -> AsyncGenerator[tuple[Plane, Transfers, Volumes, PodmanStorage]]:
     """As much of a gateway as transfers need."""
     await asyncio.to_thread(folder.mkdir)
-    plane_config = PlaneConfig(listen=(ends[0],), connect=tuple(ends[1:]))
+    own, other = ends
+    plane_config = PlaneConfig(listen=(own,), peers={gateway: own, "there" if gateway == "here" else "here": other})
     async with contextlib.AsyncExitStack() as stack:
         plane = await Plane.open(plane_config, fleet=fleet, gateway=gateway, data_dir=folder)
         stack.push_async_callback(plane.close)

@@ -5,15 +5,15 @@ side stands still for a lease the other closes both and begins anew; the one tha
 links one after the other, and in between takes the new link for a further one of the old transport. From then on the
 two mean different keys by the same numbers (zenoh issue 1886): questions arrive at wrong doors or nowhere, for as long
 as that link lives. In a fleet of eight with two links between each pair the fifth standstill mixed some up, and after
-most of the next eighteen some were (docs/benchmarks.md); with one link between each pair none of 48 did.
+most of the next nineteen some were (docs/benchmarks.md); with one link between each pair none of 48 did.
 
 With one link this cannot happen: Zenoh takes one incoming link of a transport and no more, so that whoever dials anew
 is refused until the old link's end has been noticed, and with that link the old transport is gone.
 
 So each gateway has a rank, and the higher one dials. A gateway that is named in the others' `plane.peers` has a rank by
-its name; one that only names others (`plane.connect`) is above all of those. Zenoh's gossip goes by the same order: of
-two that hear of each other the one with the greater session id dials, and the id ends with the rank. (Zenoh compares
-ids from their last byte on.)
+its name; one that only names others (`plane.connect`) is above all of those. One with a table dials by nothing else.
+Those without go by Zenoh's gossip too, in the same order: of two that hear of each other the one with the greater
+session id dials, and the id ends with the rank. (Zenoh compares ids from their last byte on.)
 """
 
 import secrets
@@ -27,7 +27,7 @@ _NAMED, _NAMING = 0x20, 0xE0
 
 
 def rank(gateway: str) -> bytes:
-    """The rank among those that are named in `plane.peers`; by hash, since a table may lack some for a while."""
+    """The rank of a gateway; by hash, which two tables agree on that have not all names in common."""
     return bytes([_NAMED]) + blake2b(gateway.encode(), digest_size=_RANK_BYTES - 1).digest()
 
 

@@ -146,7 +146,8 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
         "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
         "connect/exit_on_failure": client,
         # One that is restarted waits to be dialled by those above it, and a recorder misses what it says meanwhile: so
-        # each pause is 5 ms and a fiftieth of the time that it has been away, up to 0.2 s.
+        # each pause is 5 ms and a fiftieth of the time that it has been away, up to 0.2 s. (An attempt that nothing
+        # answers at all, as when its machine was off, takes up to `open_timeout` besides.)
         "connect/retry": {
             "period_init_ms": 50 if client else 5,
             "period_max_ms": 1000 if client else 200,
@@ -173,9 +174,14 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
         "transport/unicast/accept_timeout": 3000,
     }
     if config.mode == "peer" and config.listen:
-        settings["id"] = dialling.session_id(gateway, naming=bool(config.connect) and not config.peers)
+        table = bool(set(config.peers) - {gateway})
+        settings["id"] = dialling.session_id(gateway, naming=bool(config.connect) and not table)
         # Nobody can dial a peer that does not listen: that one dials all.
         settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+        if table:
+            # Gossip names addresses where the table may have host names: a gateway would dial by both, and, linked by
+            # one, be refused by the other again and again for as long as the link lives.
+            settings["scouting/gossip/autoconnect"] = {"router": [], "peer": [], "client": []}
     made = zenoh.Config()
     for key, value in settings.items():
         made.insert_json5(key, msgspec.json.encode(value).decode())
@@ -204,7 +210,7 @@ def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
             remedy="is the fleet up? try `swiftbot up` or `--connect`",
         )
     return ConfigError(
-        f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect"
+        f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect, plane.peers"
     )
 
 

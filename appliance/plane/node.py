@@ -15,6 +15,7 @@ from appliance.errors import ConfigError, DeadlineError, SwiftbotError, Unreacha
 from appliance.plane.bounded import BoundedMembership
 from appliance.plane.browsing import Browsing
 from appliance.plane.dht import Dht
+from appliance.plane.dialling import dialled
 from appliance.plane.keys import Keys, check_name
 from appliance.plane.membership import Membership
 from appliance.plane.namesake import displaced
@@ -43,6 +44,8 @@ BACK_S = 0.25
 Somebody who is seen and does not answer must not hold it up."""
 GIVE_S = 10.0
 """How long one that has to go gives its records away: thousands, where the others answer."""
+UNSEEN_S = 10.0
+"""After so long those that `plane.peers` names and that have not come are told of, once."""
 MOST_ASKED = 3
 ASK_TIMEOUT_S = 0.5
 """One that is busy for longer is no help: what is linked directly counts then."""
@@ -112,6 +115,7 @@ class Plane:
         """When, on this machine's monotonic clock, `session` and `store` were open; `linked` to somebody; `present`: it
         knew who is there; `fetched` what it will own; `joined`: the others can see it; `reconciled`: it answers for its
         keys with its shard compared."""
+        self._unseen: asyncio.TimerHandle | None = None
         self._back = asyncio.Event()
         self._away_s = 0.0
         """For how long nothing was written here before."""
@@ -139,6 +143,7 @@ class Plane:
             PrerequisiteError: the disk is full or fails.
         """
         check_name(gateway, "gateway")
+        config.check_own(gateway)
         away_s = _unwritten_s(data_dir / STORE_FILE)
         session, opened, store = await _open_both(config, fleet, gateway, data_dir / STORE_FILE)
         plane: Plane | None = None
@@ -213,6 +218,19 @@ class Plane:
         if self.gateway in self.config.voters:
             self._forgetting.start()
         log.info("joined", gateway=self.gateway, members=sorted(membership.members))
+        self._unseen = asyncio.get_running_loop().call_later(UNSEEN_S, self._tell_unseen)
+
+    def _tell_unseen(self) -> None:
+        """Say which gateways of the table have not come: two that each wait for the other's call are two fleets."""
+        unseen = sorted(set(self.config.peers) - self._membership.members - {self.gateway})
+        if unseen and self.config.view == "full":
+            ours = dialled(self.gateway, self.config.peers)
+            log.warning(
+                "gateways named in plane.peers are not seen",
+                unseen=unseen,
+                dialled=[name for name in unseen if self.config.peers[name] in ours],
+                remedy="are they up, with this gateway in their plane.peers? all but `dialled` are to dial this one",
+            )
 
     async def _first_link(self) -> None:
         """Wait a moment for the first link: only then is it known who is there already."""
@@ -301,6 +319,8 @@ class Plane:
 
     async def close(self) -> None:
         """Leave the fleet and close the store; more than once does no harm."""
+        if self._unseen is not None:
+            self._unseen.cancel()
         if self._outlived is not None:
             await self._outlived.close()
         await self._membership.leave()

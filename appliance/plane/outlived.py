@@ -30,7 +30,7 @@ PAUSE_LEASES = 0.5
 ANSWER_LEASES = 2.0
 """Leases that a member is given to answer, who may be busy with the same news."""
 BACK_LEASES = 2.0
-"""Leases after which those that were lost must have come back: each dials again every 0.2 s."""
+"""Leases after which those that were lost must have come back: of each two one dials again every 0.2 s."""
 REST_S = 30.0
 """Least time between two such looks: where a machine starves, links made anew are more work and no help. A standstill
 within it is looked at once it is over."""

@@ -20,13 +20,13 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     listen: tuple[str, ...] = ()
     """Endpoints to accept links on, such as `tcp/0.0.0.0:7447`; empty: accept none."""
     connect: tuple[str, ...] = ()
-    """Endpoints to keep linked to: of routers, or of gateways that do not name this one. Gossip finds the others, but a
-    single cut link is redialled only where it is named. Gateways that name each other belong into `peers` instead."""
+    """Endpoints to keep linked to: of routers, or of gateways that name nobody in `connect` themselves. Gossip finds
+    the others, but a single cut link is redialled only where it is named. Gateways that know each other belong into
+    `peers`."""
     peers: dict[str, str] = field(default_factory=dict[str, str])
-    """All gateways of a fleet of peers, by name: the endpoint under which the others reach each, as in
-    `{gw-1 = "tcp/10.0.0.1:7447", gw-2 = "tcp/10.0.0.2:7447"}`. The same table in each of them: of each two, one dials
-    the other, so that a standstill of either cannot mix up two links between them. A new gateway whose name the others
-    do not have yet names some of them in `connect`."""
+    """All gateways of a fleet of peers, this one among them, by `id`: the endpoint under which the others reach each,
+    as in `{gw-1 = "tcp/10.0.0.1:7447", gw-2 = "tcp/10.0.0.2:7447"}`. The same table in each of them: of each two, one
+    dials the other, so that a standstill of either cannot mix up two links between them."""
     replicas: int = 3
     """Copies of a record, the owner's among them: two gateways may die at once without losing one (design: r = 3)."""
     virtual_nodes: int = 32
@@ -131,8 +131,29 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             )
         if len(set(self.peers.values())) < len(self.peers):
             raise ConfigError("plane.peers has an endpoint twice", remedy="each gateway has one of its own")
+        for name, endpoint in self.peers.items():
+            host, _, port = endpoint.partition("/")[2].rpartition(":")
+            if host in _ANY or port == "0":
+                raise ConfigError(
+                    f"plane.peers: {endpoint!r} of {name} is nothing that can be dialled",
+                    remedy="write the address and port under which the others reach it",
+                )
+            if endpoint in self.connect:
+                raise ConfigError(
+                    f"plane.connect names {endpoint}, which {name} has in plane.peers",
+                    remedy="remove it from plane.connect: of the two one dials the other already",
+                )
+
+    def check_own(self, gateway: str) -> None:
+        """Raise ConfigError when the table of `peers` is not one that this gateway can go by."""
+        if self.peers and gateway not in self.peers:
+            raise ConfigError(
+                f"plane.peers lacks this gateway, {gateway}; it has {', '.join(sorted(self.peers))[:200]}",
+                remedy="name each gateway by its id, this one too, the same in all of them",
+            )
 
 
+_ANY = frozenset({"0.0.0.0", "[::]", "*", ""})  # noqa: S104 - hosts to listen on that nobody can dial
 _LEAST: dict[str, float] = {
     "replicas": 1,
     "virtual_nodes": 1,

@@ -19,7 +19,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 class Fleet:
-    """Gateways in this process, each with its own endpoint and file; all are given only the first's endpoint."""
+    """Gateways in this process, each with its own endpoint and file; all have the same table of them."""
 
     def __init__(self, folder: Path, ports: list[int], **settings: float) -> None:
         self.folder = folder
@@ -29,10 +29,8 @@ class Fleet:
 
     async def start(self, number: int) -> Plane:
         """Start one gateway."""
-        connect = tuple(each for each in self.endpoints if each != self.endpoints[number])
-        config = msgspec.convert(
-            {"listen": (self.endpoints[number],), "connect": connect, **self.settings}, PlaneConfig
-        )
+        peers = {f"g{each}": endpoint for each, endpoint in enumerate(self.endpoints)}
+        config = msgspec.convert({"listen": (self.endpoints[number],), "peers": peers, **self.settings}, PlaneConfig)
         plane = await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=self.folder / f"g{number}")
         self.planes[number] = plane
         return plane

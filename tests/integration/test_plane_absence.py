@@ -44,7 +44,8 @@ async def planes(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncI
     made: list[Plane] = []
     try:
         for number, end in enumerate(ends):
-            config = PlaneConfig(listen=(end,), connect=tuple(each for each in ends if each != end))
+            peers = {f"g{each}": other for each, other in enumerate(ends)}
+            config = PlaneConfig(listen=(end,), peers=peers)
             folder = tmp_path / f"g{number}"
             made.append(await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=folder))
         await settled(made)

@@ -28,8 +28,8 @@ async def _fleet(folder: Path, ports: list[int]) -> AsyncIterator[list[Plane]]:
     planes: list[Plane] = []
     async with contextlib.AsyncExitStack() as stack:
         for name, endpoint in zip(names, endpoints, strict=True):
-            others = tuple(each for each in endpoints if each != endpoint)
-            config = PlaneConfig(listen=(endpoint,), connect=others, voters=names)
+            peers = dict(zip(names, endpoints, strict=True))
+            config = PlaneConfig(listen=(endpoint,), peers=peers, voters=names)
             planes.append(await Plane.open(config, fleet="browse", gateway=name, data_dir=folder / name))
             stack.push_async_callback(planes[-1].close)
         while not all(len(each.members()) == len(planes) and each.dht.settling.reconciled() for each in planes):

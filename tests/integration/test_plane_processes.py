@@ -22,9 +22,7 @@ from appliance.plane.settings import PlaneConfig
 
 async def main():
     number, folder, *endpoints = int(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:]
-    peers = {f"g{number}": each for number, each in enumerate(endpoints)}
-    if number in (1, 2):  # the tables of these two lack each other
-        del peers[f"g{3 - number}"]
+    peers = {f"g{each}": endpoint for each, endpoint in enumerate(endpoints)}
     if number < len(endpoints):
         config = PlaneConfig(listen=(endpoints[number],), peers=peers, lease_ms=LEASE_MS)
     else:  # a newcomer that the others have not been told of
@@ -204,7 +202,7 @@ async def test_a_frozen_owner_is_replaced_and_comes_back(fleet: Fleet) -> None:
 async def test_a_standstill_mixes_up_no_links(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
     """Each gateway in turn stands still for a lease and more: then each two have one link again, and each is answered.
 
-    One of the five is a newcomer that the others do not name, and two are not in each other's tables.
+    One of the five is a newcomer that the others do not name.
     """
     made = Fleet(tmp_path, [f"tcp/127.0.0.1:{port}" for port in free_ports(4)], lease_ms=500)
     try:

@@ -34,7 +34,7 @@ class Fleet:
         """Start one gateway and wait until all that are there see it."""
         own = {
             "listen": (self.endpoints[number],),
-            "connect": tuple(each for each in self.endpoints if each != self.endpoints[number]),
+            "peers": {f"g{each}": endpoint for each, endpoint in enumerate(self.endpoints)},
             "voters": self.voters,
         }
         config = msgspec.convert({**own, **self.settings, **settings}, PlaneConfig)

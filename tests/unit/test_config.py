@@ -62,11 +62,34 @@ def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
         fleet="yard",
         data_dir='/tmp/with "quotes" and \\ backslash',
         skills=("/a", "/b"),
-        plane=PlaneConfig(listen=("tcp/127.0.0.1:7447",)),
+        plane=PlaneConfig(
+            listen=("tcp/127.0.0.1:7447",), peers={"gw-7": "tcp/10.0.0.7:7447", "gw-8.west": "tcp/10.0.0.8:7447"}
+        ),
         pool=PoolConfig(floor={"base": 3}, mode="local"),
         robots=RobotsConfig(mavlink=(MavlinkLink(names={"1": "drone_1"}),)),
     )
     assert config.load(write(tmp_path / "g.toml", config.dump(made))) == made
+
+
+def test_endpoints_are_this_gateways_and_the_others_each_once() -> None:
+    """A recorder dials what the gateway listens on, what it names, and the others of its table."""
+    made = GatewayConfig(
+        id="gw-7",
+        plane=PlaneConfig(
+            listen=("tcp/0.0.0.0:7447",),
+            connect=("tcp/10.0.0.1:7447",),
+            peers={"gw-7": "tcp/10.0.0.7:7447", "gw-8": "tcp/10.0.0.8:7447"},
+        ),
+    )
+    assert made.endpoints() == ("tcp/0.0.0.0:7447", "tcp/10.0.0.1:7447", "tcp/10.0.0.8:7447")
+    assert GatewayConfig(id="gw-7").endpoints() == ()
+
+
+def test_a_wrong_table_of_gateways_is_told_with_the_file(tmp_path: Path) -> None:
+    """The message names file and key, before anything is started."""
+    path = write(tmp_path / "g.toml", 'id = "gw-7"\n[plane]\nlisten = ["tcp/h:1"]\npeers = {gw-8 = "tcp/h:1"}\n')
+    with pytest.raises(ConfigError, match=r"g\.toml: plane\.peers lacks this gateway, gw-7"):
+        config.load(path)
 
 
 def test_the_documentation_lists_every_key(project_root: Path) -> None:

@@ -260,7 +260,7 @@ class _Rounds:
         by_all: list[float] = []
         adopted: list[float] = []
         parts: dict[str, list[float]] = {"settled": [], "taken_up": [], "written": []}
-        tasks = 0
+        tasks = ended_before = 0
         problems: list[str] = []
         told_twice: list[str] = []
         for number in range(rounds):
@@ -285,6 +285,7 @@ class _Rounds:
             lost = await self._lost(tails, victim)
             by_all.append((max(lost.values()) - at) * 1e3)
             taken = await self._adopted(tails, theirs, victim)
+            ended_before += len(theirs) - len(taken)
             for each in taken.values():
                 seen_at = lost[each.by]
                 detected.append((seen_at - at) * 1e3)
@@ -307,9 +308,14 @@ class _Rounds:
             await self._arena.settled(self._client, ready=0)
             problems += await apart(heard.tellers(names), self._record)
         heard.close()
+        if not adopted:
+            raise DeadlineError(
+                "every task had ended before its coordinator was lost", remedy="give --sleep-ms more than on this run"
+            )
         return {
             "rounds": rounds,
             "tasks": tasks,
+            "tasks_ended_before": ended_before,
             "tasks_taken_over": len(adopted),
             "not_exactly_once": problems,
             "told_by_two": told_twice,

@@ -23,6 +23,13 @@ def test_the_defaults_are_valid() -> None:
         (PlaneConfig(listen=("tcp/h:1",), peers={"gw/1": "tcp/h:1"}), "plane.peers"),
         (PlaneConfig(listen=("tcp/h:1",), peers={"a": "tcp/h:1", "b": "tcp/h:1"}), "an endpoint twice"),
         (PlaneConfig(peers={"a": "tcp/h:1"}), "plane.listen is empty"),
+        (PlaneConfig(listen=("tcp/h:1",), peers={"a": "tcp/0.0.0.0:1"}), "nothing that can be dialled"),
+        (PlaneConfig(listen=("tcp/h:1",), peers={"a": "tcp/[::]:1"}), "nothing that can be dialled"),
+        (PlaneConfig(listen=("tcp/h:1",), peers={"a": "tcp/h:0"}), "nothing that can be dialled"),
+        (
+            PlaneConfig(listen=("tcp/h:1",), connect=("tcp/i:1",), peers={"a": "tcp/h:1", "b": "tcp/i:1"}),
+            "plane.connect names tcp/i:1, which b has in plane.peers",
+        ),
         (PlaneConfig(mode="client", connect=("tcp/h:1",), peers={"a": "tcp/h:1"}), "plane.mode is client"),
         (PlaneConfig(mode="client", connect=("tcp/h:1",), listen=("tcp/h:2",)), "accepts no links"),
         (PlaneConfig(view=5), "plane.view is 5"),
@@ -36,4 +43,14 @@ def test_what_cannot_work_is_named(config: PlaneConfig, says: str) -> None:
     """A setting that cannot work is an error that names it, with a remedy."""
     with pytest.raises(ConfigError, match=says) as caught:
         config.check()
+    assert caught.value.remedy
+
+
+def test_a_gateway_is_in_its_own_table() -> None:
+    """Otherwise it and the others would decide by different names which of two dials."""
+    config = PlaneConfig(listen=("tcp/h:1",), peers={"gw-1": "tcp/h:1", "gw-2": "tcp/i:1"})
+    config.check_own("gw-1")
+    PlaneConfig().check_own("gw-1")
+    with pytest.raises(ConfigError, match="lacks this gateway, berth-1; it has gw-1, gw-2") as caught:
+        config.check_own("berth-1")
     assert caught.value.remedy
