@@ -4,8 +4,8 @@ Where each dials the other there are two links, one made by either side, and bot
 side stands still for a lease the other closes both and begins anew; the one that runs again notices the ends of its two
 links one after the other, and in between takes the new link for a further one of the old transport. From then on the
 two mean different keys by the same numbers (zenoh issue 1886): questions arrive at wrong doors or nowhere, for as long
-as that link lives. In a fleet of eight with two links between each pair the fifth standstill mixed some up, and after
-most of the next nineteen some were (docs/benchmarks.md); with one link between each pair none of 48 did.
+as that link lives. In a fleet of eight with two links between each pair some gateway did not answer another after
+fourteen of 23 standstills; with one link between each pair all did after each of 72 (docs/benchmarks.md).
 
 With one link this cannot happen: Zenoh takes one incoming link of a transport and no more, so that whoever dials anew
 is refused until the old link's end has been noticed, and with that link the old transport is gone.
