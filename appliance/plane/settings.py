@@ -8,7 +8,8 @@ from msgspec import Struct, field
 from appliance.errors import ConfigError, PayloadError
 from appliance.plane.keys import check_name
 
-_PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "serial"})
+_WITH_PORT = frozenset({"tcp", "udp", "tls", "quic", "ws"})
+_PROTOCOLS = _WITH_PORT | {"unixsock-stream", "serial"}
 
 
 class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -81,7 +82,7 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                     raise ConfigError(
                         f"plane.{name}: {endpoint!r} is not an endpoint", remedy="write it like tcp/192.168.1.10:7447"
                     )
-                if protocol in ("tcp", "udp", "tls", "quic", "ws"):
+                if protocol in _WITH_PORT:
                     _check_port(name, endpoint, address)
         if self.mode == "client" and not self.connect:
             raise ConfigError("plane.connect is empty", remedy="a client needs an endpoint of a gateway or router")
@@ -132,8 +133,9 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if len(set(self.peers.values())) < len(self.peers):
             raise ConfigError("plane.peers has an endpoint twice", remedy="each gateway has one of its own")
         for name, endpoint in self.peers.items():
-            host, _, port = endpoint.partition("/")[2].rpartition(":")
-            if host in _ANY or port == "0":
+            protocol, _, address = endpoint.partition("/")
+            host, _, port = address.rpartition(":")
+            if protocol in _WITH_PORT and (host in _ANY or port == "0"):
                 raise ConfigError(
                     f"plane.peers: {endpoint!r} of {name} is nothing that can be dialled",
                     remedy="write the address and port under which the others reach it",

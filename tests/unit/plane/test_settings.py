@@ -46,6 +46,12 @@ def test_what_cannot_work_is_named(config: PlaneConfig, says: str) -> None:
     assert caught.value.remedy
 
 
+def test_a_table_may_have_endpoints_without_ports() -> None:
+    """A socket in the file system is dialled by its path."""
+    listen = "unixsock-stream//run/swiftbot/a.sock"
+    PlaneConfig(listen=(listen,), peers={"a": listen, "b": "unixsock-stream//run/swiftbot/b.sock"}).check()
+
+
 def test_a_gateway_is_in_its_own_table() -> None:
     """Otherwise it and the others would decide by different names which of two dials."""
     config = PlaneConfig(listen=("tcp/h:1",), peers={"gw-1": "tcp/h:1", "gw-2": "tcp/i:1"})
