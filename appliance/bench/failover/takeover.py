@@ -27,7 +27,7 @@ from appliance.bench.pooled import SKILL, fleet_name, write_skill
 from appliance.bench.workspace import workspace
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
+from appliance.errors import DeadlineError, SwiftbotError
 from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.plane.ring import Ring
@@ -337,21 +337,8 @@ class _Rounds:
         names = [f"{prefix}-{number}" for number in range(self._options.tasks)]
         for name in names:
             plan = Plan(domain="coordination", subtasks=steps)
-            await self._hand_in(TaskRequest(id=name, instruction=name, plan=plan))
+            await self._client.submit(TaskRequest(id=name, instruction=name, plan=plan))
         return names
-
-    async def _hand_in(self, request: TaskRequest) -> None:
-        """Hand a task in, again while nobody answers: links may just be made anew, and its id makes that safe."""
-        give_up = time.monotonic() + STEP_S
-        while True:
-            try:
-                await self._client.submit(request)
-            except UnreachableError:
-                if time.monotonic() > give_up:
-                    raise
-                await asyncio.sleep(0.2)
-            else:
-                return
 
     async def _running(self, names: list[str]) -> list[TaskRecord]:
         """Wait until each task has a run under way."""
