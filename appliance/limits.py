@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 
 from appliance.config import GatewayConfig
-from appliance.llm.safety.checks import strictest
+from appliance.llm.checks.policy import strictest
 from appliance.model import RobotInfo, Site
 from appliance.robots.bounds import Bounds, Orders, Usual
 

@@ -29,15 +29,15 @@ from appliance.llm.routing.canonical import catalogue_digest, digest, plan_key
 from appliance.llm.routing.gate import Gate
 from appliance.llm.routing.privacy import Privacy
 from appliance.llm.routing.thresholds import Thresholds
-from appliance.llm.safety.checks import unsafe
+from appliance.llm.checks.policy import unsafe
 from appliance.llm.safety.confirming import reasons_to_confirm
-from appliance.llm.safety.grounding import ungrounded
+from appliance.llm.checks.grounding import ungrounded
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome, TierAttempt
 from appliance.llm.so_far import so_far
 from appliance.llm.tier import Planner, Proposal
 from appliance.llm.tiers import Slot, configured
-from appliance.llm.validate import MAX_PROBLEMS, validate
+from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.model import Plan, PlannerStatus, Provenance, TaskRecord, Tier, plan_hash
 from appliance.skills.catalogue import Catalogue
 

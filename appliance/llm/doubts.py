@@ -11,7 +11,7 @@ import itertools
 import re
 from collections.abc import Iterable
 
-from appliance.llm.sense import NUMBERS, Meaning, before
+from appliance.llm.checks.consistency import NUMBERS, Meaning, before
 
 _KIND = r"(robot|drone|rover|ugv|uav|auv|bot|arm|cart|unit)"
 _NUMBERED = re.compile(rf"\b{_KIND}[ _]?(\d+|{'|'.join(list(NUMBERS)[1:10])})\b")

@@ -11,7 +11,7 @@ import unicodedata
 from collections.abc import Sequence
 
 from appliance.errors import PlanError
-from appliance.llm.validate import MAX_PROBLEMS
+from appliance.llm.checks.schema import MAX_PROBLEMS
 from appliance.model import TierAttempt
 
 MAX_CHARACTERS = 4000

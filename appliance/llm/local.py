@@ -25,13 +25,13 @@ from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import words_of
 from appliance.llm.process import ModelProcess
 from appliance.llm.prompt import messages
-from appliance.llm.safety.contradictions import contradictions
+from appliance.llm.checks.contradiction import contradictions
 from appliance.llm.schema import plan_grammar, read_plan, robot_names
-from appliance.llm.sense import Meaning, problems
+from appliance.llm.checks.consistency import Meaning, problems
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.speaking import Question, Said
 from appliance.llm.tier import Proposal
-from appliance.llm.validate import validate
+from appliance.llm.checks.schema import validate
 from appliance.model import Plan, RobotInfo, SlotStatus, Tier
 from appliance.skills.catalogue import Catalogue
 

@@ -18,7 +18,7 @@ import msgspec
 from msgspec import Struct, field
 
 from appliance.errors import PlanError
-from appliance.llm.validate import MAX_SUBTASKS
+from appliance.llm.checks.schema import MAX_SUBTASKS
 from appliance.model import Plan, RobotInfo, Site, Subtask, Tier
 from appliance.skills.catalogue import Catalogue, Param, SkillManifest
 

@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import PlanContext
-from appliance.llm.validate import validate
+from appliance.llm.checks.schema import validate
 from appliance.model import Plan, Site, TaskRecord, TaskRequest, TaskState
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue

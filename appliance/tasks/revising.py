@@ -38,7 +38,7 @@ KEPT_PLANS = 3
 """Of those, how many with the plan before: a plan takes up to 20 kB."""
 MAX_INSTEAD_OF = 8
 MAX_SUBTASKS = 64
-"""As many as any plan may have (`llm.validate`)."""
+"""As many as any plan may have (`llm.checks.schema`)."""
 
 _KINDS = {
     TransitionKind.REBOUND: RevisionKind.ROBOT,

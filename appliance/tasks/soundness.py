@@ -6,7 +6,7 @@ never end (a cycle), or is beyond all bounds, is ended with the reason instead o
 
 from graphlib import CycleError, TopologicalSorter
 
-from appliance.llm.validate import MAX_SUBTASKS
+from appliance.llm.checks.schema import MAX_SUBTASKS
 from appliance.model import Failure, TaskRecord
 from appliance.tasks.bounds import MAX_DEPTH, clean, too_deep
 

@@ -19,7 +19,7 @@ from appliance.llm.cascade import Decomposer
 from appliance.llm.local import LocalTier
 from appliance.llm.schema import GRAMMAR_SUBTASKS
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.llm.validate import validate
+from appliance.llm.checks.schema import validate
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
 

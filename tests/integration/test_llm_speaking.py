@@ -21,7 +21,7 @@ from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.slot import Slot
 from appliance.llm.speaking import Question
-from appliance.llm.validate import validate
+from appliance.llm.checks.schema import validate
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
 

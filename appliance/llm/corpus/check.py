@@ -1,9 +1,9 @@
-"""Whether a pair may be trained on: its plan keeps the rules of plans (`appliance.llm.sense`).
+"""Whether a pair may be trained on: its plan keeps the rules of plans (`appliance.llm.checks.consistency`).
 
 What is left to the writer is the meaning.
 """
 
-from appliance.llm import sense
+from appliance.llm.checks import consistency as sense
 from appliance.llm.corpus.notation import Pair
 from appliance.skills.catalogue import Catalogue
 

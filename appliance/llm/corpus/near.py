@@ -10,7 +10,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
-from appliance.llm.sense import stem
+from appliance.llm.checks.consistency import stem
 from appliance.model import Subtask
 
 LITERAL = 4

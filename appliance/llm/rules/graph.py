@@ -12,7 +12,7 @@ from msgspec import Struct, field
 
 from appliance.errors import PlanError
 from appliance.llm.rules.phrases import Step
-from appliance.llm.validate import MAX_SUBTASKS
+from appliance.llm.checks.schema import MAX_SUBTASKS
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
 

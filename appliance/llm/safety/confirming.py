@@ -1,6 +1,6 @@
 """Why an operator should agree to a plan before it runs. Pure."""
 
-from appliance.llm.safety.checks import matched
+from appliance.llm.checks.policy import matched
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.model import Plan
 

@@ -12,7 +12,7 @@ from typing import cast
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.llm.validate import able
+from appliance.llm.checks.schema import able
 from appliance.model import Failure, Plan, RobotInfo, Subtask, SubtaskRecord, SubtaskState, TaskRecord
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.replan.order import before, fresh_ids, in_order

@@ -7,7 +7,7 @@ written: whoever's order stands in the record was first, and the other is told w
 from collections.abc import Mapping
 
 from appliance.errors import ConflictError, NotFoundError, RefusedError
-from appliance.llm.validate import able, is_unnamed
+from appliance.llm.checks.schema import able, is_unnamed
 from appliance.model import Approval, Plan, Proposal, RobotInfo, Subtask, SubtaskState, TaskRecord, TaskState
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.revising import ACTIVE

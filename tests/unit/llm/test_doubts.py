@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from appliance.llm.corpus.notation import parse
 from appliance.llm.doubts import doubts
-from appliance.llm.sense import Meaning
+from appliance.llm.checks.consistency import Meaning
 
 
 def doubted(text: str) -> tuple[str, ...]:

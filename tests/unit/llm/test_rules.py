@@ -9,7 +9,7 @@ from appliance.llm.rules.lexicon import noun, number, spell
 from appliance.llm.rules.modifiers import take
 from appliance.llm.rules.tier import read
 from appliance.llm.settings import PlanContext
-from appliance.llm.validate import validate
+from appliance.llm.checks.schema import validate
 from appliance.model import RobotInfo, Site
 from appliance.skills.catalogue import load_catalogue
 

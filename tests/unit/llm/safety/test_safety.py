@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import ConfigError
-from appliance.llm.safety.checks import unsafe
+from appliance.llm.checks.policy import unsafe
 from appliance.llm.safety.confirming import reasons_to_confirm
-from appliance.llm.safety.contradictions import contradictions
-from appliance.llm.safety.grounding import ungrounded
+from appliance.llm.checks.contradiction import contradictions
+from appliance.llm.checks.grounding import ungrounded
 from appliance.llm.safety.quoting import MOST, quoted
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.llm.settings import PlanContext
-from appliance.llm.validate import validate
+from appliance.llm.checks.schema import validate
 from appliance.model import Place, Plan, Pose, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue
 

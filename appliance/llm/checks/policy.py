@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from appliance.llm.safety.contradictions import contradictions, precedes
-from appliance.llm.safety.places import known_as, parts_of, spot_of
+from appliance.llm.checks.contradiction import contradictions, precedes
+from appliance.llm.checks.places import known_as, parts_of, spot_of
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.llm.settings import PlanContext
-from appliance.llm.validate import MAX_PROBLEMS, able, is_unnamed, shown
+from appliance.llm.checks.schema import MAX_PROBLEMS, able, is_unnamed, shown
 from appliance.model import Plan, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue
 

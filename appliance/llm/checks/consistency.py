@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from msgspec import Struct
 
 from appliance.llm.language.plurals import singular
-from appliance.llm.validate import JOINT
+from appliance.llm.checks.schema import JOINT
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue, SkillManifest
 

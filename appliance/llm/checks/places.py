@@ -3,7 +3,7 @@
 import math
 import re
 
-from appliance.llm.validate import locate
+from appliance.llm.checks.schema import locate
 from appliance.model import Place, Site
 from appliance.skills.sites import plain_name
 

@@ -10,10 +10,10 @@ import re
 from collections.abc import Iterable
 
 from appliance.llm.language.values import figures
-from appliance.llm.safety.checks import robots_of
-from appliance.llm.sense import NUMBERS
+from appliance.llm.checks.policy import robots_of
+from appliance.llm.checks.consistency import NUMBERS
 from appliance.llm.settings import PlanContext
-from appliance.llm.validate import is_unnamed, shown
+from appliance.llm.checks.schema import is_unnamed, shown
 from appliance.model import Plan
 
 _TOKEN = re.compile(r"[a-z]+|\d+")

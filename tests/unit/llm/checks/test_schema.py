@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.llm.validate import MAX_PROBLEMS, MAX_SUBTASKS, locate, validate
+from appliance.llm.checks.schema import MAX_PROBLEMS, MAX_SUBTASKS, locate, validate
 from appliance.model import Plan, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
