@@ -4,7 +4,7 @@
 generated classes are untyped in practice (fields appear by name), so the rest of the room sees `Frame`.
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as _dialect
@@ -19,8 +19,8 @@ from appliance.robots.mavlink.frames import (
     check,
     frame_length,
     marked,
-    next_marker,
 )
+from appliance.robots.mavlink.framing import Reader
 from appliance.robots.mavlink.kinds import CommandCancel, Message
 from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG, Signer, wall_ticks
 
@@ -87,63 +87,32 @@ class Codec:
         frame = marked(raw, number, signed=True)
         return frame + self.signer.signature(frame, self.signer.stamp(self._clock()))
 
-    def read(self, data: bytes, *, more: bool = False) -> Generator[Frame | Damage, None, int]:
-        """Yield what a datagram (or a piece of a log or stream) holds, in order; never raises.
-
-        After a damaged frame the search goes on at the first good frame that begins within it (its length may be
-        what was damaged), else behind it, so that one flipped byte costs one frame.
-
-        Args:
-            data: the bytes.
-            more: more will follow, so that a frame that is not whole waits instead of being damage.
-
-        Returns:
-            How many bytes were used: all of them unless more will follow.
-        """
-        at = 0
-        while at < len(data):
-            if data[at] not in (MARKER_V2, MARKER_V1):
-                following = next_marker(data, at + 1)
-                yield Damage("noise", following - at)
-                at = following
+    def read(self, data: bytes) -> Iterator[Frame | Damage]:
+        """Yield what a datagram (or a log) holds, in order; never raises. Nothing is taken to follow it."""
+        if len(data) > 2 and data[0] in (MARKER_V2, MARKER_V1) and frame_length(data, 0) == len(data):
+            found = check(data)
+            if isinstance(found, Frame):
+                yield self.judged(found)
+                return
+        held: Damage | None = None
+        for each in Reader(self.unproven).feed(data, end=True):
+            if isinstance(each, Damage) and held is not None and not each.counted:
+                held = Damage(held.kind, held.length + each.length)
                 continue
-            length = frame_length(data, at)
-            if length is None or at + length > len(data):
-                if more:
-                    return at
-                following = next_marker(data, at + 1)
-                yield Damage("truncated", following - at)
-                at = following
-                continue
-            result = self._decode(data[at : at + length])
-            if isinstance(result, Damage):
-                length = self._resume(data, at, length, more=more) - at
-                result = Damage(result.kind, length)
-            yield result
-            at += length
-        return at
+            if held is not None:
+                yield held
+            held = each if isinstance(each, Damage) else None
+            if held is None:
+                yield each
+        if held is not None:
+            yield held
 
-    def _resume(self, data: bytes, at: int, length: int, *, more: bool) -> int:
-        """Return where to go on after a damaged frame of that announced length."""
-        inner = next_marker(data, at + 1)
-        while inner < at + length:
-            size = frame_length(data, inner)
-            if size is None or inner + size > len(data):
-                if more:
-                    return inner  # may become a frame
-            elif isinstance(check(data[inner : inner + size]), Frame):  # its signature is looked at once, when read
-                return inner
-            inner = next_marker(data, inner + 1)
-        behind = at + length
-        return behind if behind == len(data) or data[behind] in (MARKER_V1, MARKER_V2) else inner
+    def judged(self, frame: Frame) -> Frame | Damage:
+        """Return a frame whose checksum is right, or why it is not believed."""
+        problem = self.unproven(frame)
+        return Damage(problem, len(frame.raw)) if problem else frame
 
-    def _decode(self, raw: bytes) -> Frame | Damage:
-        found = check(raw)
-        if isinstance(found, Frame) and (problem := self._unproven(found)):
-            return Damage(problem, len(raw))
-        return found
-
-    def _unproven(self, frame: Frame) -> str:
+    def unproven(self, frame: Frame) -> str:
         """Return why a frame whose checksum is right is not believed; empty when it is."""
         raw = frame.raw
         if self.signer is None:
@@ -158,19 +127,20 @@ class Stream:
     """Frames out of a stream of bytes (TCP, serial), in which a frame may come in pieces."""
 
     def __init__(self, codec: Codec) -> None:
-        self._codec = codec
-        self._rest = b""
+        self._reader = Reader(codec.unproven)
 
     @property
     def pending(self) -> int:
-        """Bytes of a frame that has begun: at most one frame's."""
-        return len(self._rest)
+        """Bytes that are not decided yet."""
+        return self._reader.pending
 
     def feed(self, data: bytes) -> Iterator[Frame | Damage]:
-        """Yield what is whole now; never raises. What may still become a frame waits for more."""
-        data = self._rest + data
-        used = yield from self._codec.read(data, more=True)
-        self._rest = data[used:]
+        """Yield what these bytes decide; never raises."""
+        return self._reader.feed(data)
+
+    def end(self) -> Iterator[Frame | Damage]:
+        """Yield what is left to decide when no more will come."""
+        return self._reader.feed(b"", end=True)
 
 
 def make(name: str, /, **fields: Any) -> Message:

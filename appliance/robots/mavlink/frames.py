@@ -12,7 +12,7 @@ from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG
 
 MARKER_V2 = 0xFD
 MARKER_V1 = 0xFE
-_HEADER_V2, _HEADER_V1, _CHECKSUM = 10, 6, 2
+HEADER_V2, HEADER_V1, _CHECKSUM = 10, 6, 2
 
 
 class Frame(Struct, gc=False, eq=False):
@@ -43,11 +43,13 @@ class Damage(Struct, frozen=True):
     """Bytes that made no frame, or one that is not believed.
 
     `checksum`, `unknown_message`, `truncated`, `incompatible`, `noise`; `signed` (there is no key here), `unsigned`,
-    `bad_signature`, `replayed`.
+    `bad_signature`, `replayed`. Damage is told when it is seen, and its bytes, where they are not sure to be lost
+    then, behind it (`counted` is false): the two are one damage.
     """
 
     kind: str
     length: int
+    counted: bool = True
 
 
 def frame_length(data: bytes, at: int) -> int | None:
@@ -55,8 +57,8 @@ def frame_length(data: bytes, at: int) -> int | None:
     if len(data) - at < 3:
         return None
     if data[at] == MARKER_V1:
-        return _HEADER_V1 + data[at + 1] + _CHECKSUM
-    return _HEADER_V2 + data[at + 1] + _CHECKSUM + (SIGNATURE_BYTES if data[at + 2] & SIGNED_FLAG else 0)
+        return HEADER_V1 + data[at + 1] + _CHECKSUM
+    return HEADER_V2 + data[at + 1] + _CHECKSUM + (SIGNATURE_BYTES if data[at + 2] & SIGNED_FLAG else 0)
 
 
 def next_marker(data: bytes, start: int) -> int:
@@ -71,9 +73,9 @@ def check(raw: bytes) -> Frame | Damage:
     if raw[0] == MARKER_V2:
         if raw[2] & ~SIGNED_FLAG:
             return Damage("incompatible", len(raw))
-        start, place, number = _HEADER_V2, 4, raw[7] | raw[8] << 8 | raw[9] << 16
+        start, place, number = HEADER_V2, 4, raw[7] | raw[8] << 8 | raw[9] << 16
     else:
-        start, place, number = _HEADER_V1, 2, raw[5]
+        start, place, number = HEADER_V1, 2, raw[5]
     kind = KINDS.get(number)
     if kind is None:
         return Damage("unknown_message", len(raw))
@@ -105,7 +107,7 @@ def as_v2(raw: bytes) -> bytes:
         return raw
     length, sequence, system, component, number = raw[1:6]
     header = bytes((MARKER_V2, length, 0, 0, sequence, system, component, number, 0, 0))
-    return header + raw[_HEADER_V1:]
+    return header + raw[HEADER_V1:]
 
 
 def as_v1(raw: bytes) -> bytes:
@@ -120,6 +122,6 @@ def as_v1(raw: bytes) -> bytes:
     length = plain_lengths().get(number)
     if number > LAST_V1 or length is None:
         return b""
-    payload = raw[_HEADER_V2 : _HEADER_V2 + size].ljust(length, b"\0")[:length]
+    payload = raw[HEADER_V2 : HEADER_V2 + size].ljust(length, b"\0")[:length]
     body = bytes((length, sequence, system, component, number)) + payload
     return bytes((MARKER_V1,)) + body + checksum(body + KINDS[number].extra).to_bytes(2, "little")

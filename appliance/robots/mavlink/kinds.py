@@ -21,11 +21,15 @@ NO_FIELD = 255
 
 
 class Kind(Struct, frozen=True, gc=False):
-    """One message: number, name, CRC extra as the byte that ends what the checksum covers, offsets of its targets."""
+    """One message: number, name, CRC extra as the byte that ends what the checksum covers, offsets of its targets.
+
+    `size` is that of the longest payload, with all extension fields.
+    """
 
     number: int
     name: str
     extra: bytes
+    size: int
     system_at: int = NO_FIELD
     component_at: int = NO_FIELD
 
@@ -57,7 +61,7 @@ class CommandCancel:
         return cls(*cls._wire.unpack(payload[: cls._wire.size].ljust(cls._wire.size, b"\0")))
 
 
-_CANCEL = Kind(80, CommandCancel.name, b"\x0e", 2, 3)
+_CANCEL = Kind(80, CommandCancel.name, b"\x0e", 4, 2, 3)
 
 
 def _slowly(data: bytes) -> int:
@@ -86,6 +90,7 @@ def _kind(number: int, message: Any) -> Kind:
         number,
         message.msgname,
         bytes((message.crc_extra,)),
+        at,
         offsets.get("target_system", NO_FIELD),
         offsets.get("target_component", NO_FIELD),
     )

@@ -2,7 +2,7 @@
 
 import abc
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from appliance.errors import ConfigError
 from appliance.robots.mavlink.address import Address
@@ -105,15 +105,20 @@ class Link(abc.ABC):
         self.damaged[kind] = self.damaged.get(kind, 0) + 1
         self.refused[kind] = self.refused.get(kind, 0) + 1
 
-    def take(self, found: Frame | Damage, address: Address) -> None:
-        """Pass on a frame, or count what is none."""
-        if isinstance(found, Damage):
-            self.count(found.kind)
-        else:
-            stats = self.stats
-            stats.frames_in += 1
-            stats.bytes_in += len(found.raw)
-            self._on_frame(found, address)
+    def take(self, found: Iterable[Frame | Damage], address: Address) -> int:
+        """Pass on frames, count what is none; return how many pieces there were of both."""
+        pieces, stats = 0, self.stats
+        for each in found:
+            if isinstance(each, Damage):
+                if not each.counted:
+                    continue
+                self.count(each.kind)
+            else:
+                stats.frames_in += 1
+                stats.bytes_in += len(each.raw)
+                self._on_frame(each, address)
+            pieces += 1
+        return pieces
 
     def feed(self, data: bytes, address: Address) -> None:
         """Take in a datagram; those of an end that sends more than it may are dropped and counted."""
@@ -121,11 +126,7 @@ class Link(abc.ABC):
         if self._limiter.wait_s(address, now):
             self.count("flood")
             return
-        found = 0
-        for each in self.codec.read(data):
-            found += 1
-            self.take(each, address)
-        self._limiter.spent(address, found, now)
+        self._limiter.spent(address, self.take(self.codec.read(data), address), now)
 
     async def pace(self, address: Address, frames: int) -> None:
         """Wait until an end of a stream may be read again: its own system then slows it down, and nothing is lost."""

@@ -86,14 +86,9 @@ class SerialLink(Link):
             if not data or self._broken.is_set():
                 self.problem = self.problem or "end of file"
                 log.warning("MAVLink serial port is gone", port=str(self.remote), reason=self.problem)
-                if stream.pending:
-                    self.count("truncated")
+                self.take(stream.end(), self.address)
                 return
-            frames = 0
-            for found in stream.feed(data):
-                frames += 1
-                self.take(found, self.address)
-            await self.pace(self.address, frames)
+            await self.pace(self.address, self.take(stream.feed(data), self.address))
             await asyncio.sleep(0)  # a fast port must not keep the others waiting
 
     @property

@@ -70,17 +70,12 @@ class _TcpLink(Link):
         log.info("MAVLink connection", link=str(self.remote), peer=f"{address[0]}:{address[1]}")
         try:
             while data := await reader.read(MAX_READ):
-                frames = 0
-                for found in stream.feed(data):
-                    frames += 1
-                    self.take(found, address)
-                await self.pace(address, frames)
+                await self.pace(address, self.take(stream.feed(data), address))
         except OSError as error:
             log.info("MAVLink connection broke", link=str(self.remote), reason=str(error))
         finally:
             del self._writers[address]
-            if stream.pending:
-                self.count("truncated")
+            self.take(stream.end(), address)
             writer.transport.abort()
 
 
