@@ -1,11 +1,16 @@
 """Faults of what is at the other ends of MAVLink links, as users of a real gateway process see them."""
 
 import asyncio
+import math
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
-from robots_process import beats, gateway_process
+from robots_process import STATION, beats, gateway_process, read_frames
+
+from appliance.robots.mavlink.dialect import Codec, make
+from appliance.robots.settings import RobotsConfig, Template
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 FOREIGN = bytes.fromhex("fd06000000050161ea0001020304fdff2ab4")
@@ -34,3 +39,39 @@ async def test_a_false_header_holds_no_vehicle_back(tmp_path: Path) -> None:
         assert not offline
         assert facts.refused == {"unknown_message": 9}
         assert facts.frames_in == 10
+
+
+async def test_a_repeated_command_is_one_task(tmp_path: Path) -> None:
+    """Sent three times, 0.5 s apart, with NaN in unused parameters, as MAVSDK does: one task by either message."""
+    templates = (Template(id=1, instruction="go to dock 3"),)
+    async with gateway_process(tmp_path, RobotsConfig(templates=templates)) as it:
+        end = it.connect("udp", await it.link("udp"))
+        station = Codec(245, 190)
+        unset: dict[str, Any] = {f"param{number}": math.nan for number in range(2, 5)}
+        common: dict[str, Any] = {"target_system": 242, "target_component": 191, "command": 31010, "param1": 1.0}
+        heard: list[Any] = []
+
+        async def acks(count: int) -> list[Any]:
+            async with asyncio.timeout(30):
+                while True:
+                    heard.extend(each.message for each in read_frames(end) if each.name == "COMMAND_ACK")
+                    done = [each for each in heard if each.result != 5]
+                    if len(done) >= count:
+                        return done
+                    await asyncio.sleep(0.1)
+
+        end.send(station.pack(make("HEARTBEAT", **STATION)))
+        for confirmation in range(3):
+            more = {f"param{number}": math.nan for number in (5, 6, 7)}
+            end.send(station.pack(make("COMMAND_LONG", confirmation=confirmation, **(common | unset | more))))
+            await asyncio.sleep(0.5)
+        first = await acks(3)
+        for _ in range(3):
+            place = {"frame": 0, "current": 0, "autocontinue": 0, "x": 0, "y": 0, "z": math.nan}
+            end.send(station.pack(make("COMMAND_INT", **(common | unset | place))))
+            await asyncio.sleep(0.5)
+        both = await acks(6)
+        assert [each.result for each in both] == [0] * 6
+        assert len({each.result_param2 for each in first}) == 1
+        assert len({each.result_param2 for each in both}) == 2
+        assert len((await it.client.tasks(100)).tasks) == 2

@@ -12,13 +12,17 @@ system or of a vehicle's: param1 is the template, param2 to param7 its arguments
 
 COMMAND_CANCEL stops the task that the sender asked for last by the command that it names, MAV_CMD_USER_2 whichever it
 asked for last (for ground stations whose buttons can send commands only). COMMAND_ACK answers by command alone, so a
-sender has one outstanding; a repetition (`confirmation` above 0) of the last one gets the last
-answer, also from a gateway that was restarted in between. How the task goes on is told by STATUSTEXT (`progress`).
+sender has one outstanding; a repetition of the last one gets the last answer, also from a gateway that was restarted in
+between. A repetition is the same command, byte for byte, with `confirmation` above 0; COMMAND_INT has no such field, so
+there it is what comes within `REPEAT_S` of the answer. While the first is being handed in the answer to either is
+IN_PROGRESS. How the task goes on is told by STATUSTEXT (`progress`).
 """
 
 import asyncio
 import math
 import secrets
+import struct
+import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable
@@ -50,6 +54,9 @@ PREFIX = "mavlink/request/"
 """Of the senders' last requests in the gateway's store."""
 MAX_SENDERS = 64
 """Whose last request is remembered; the longest silent is forgotten first."""
+REPEAT_S = 5.0
+"""How long after its last answer a COMMAND_INT that comes again is a repetition. Stations that have not heard an answer
+repeat after 0.5 s (MAVSDK) to 3 s (QGroundControl); a person who wants the same again does so later."""
 MAX_AT_WORK = 16
 """Requests being carried out at once, of different senders."""
 _NOTICE, _ERROR = texts.NOTICE, texts.ERROR
@@ -60,8 +67,13 @@ _PASSING = (RefusedError, UnreachableError, DeadlineError)
 class Asked(Struct, kw_only=True):
     """A sender's last request, kept over a restart. `result` is None until it is answered."""
 
-    parameters: tuple[float, ...]
+    parameters: tuple[float | str, ...]
+    """In words where it is no finite number, which JSON does not have."""
     task: str
+    code: str = ""
+    """What came, by `code_of`."""
+    at: float = 0.0
+    """When it came, or was answered last: seconds of the wall clock, which goes on over a restart."""
     result: int | None = None
     why: str = ""
     command: int = ASK
@@ -74,8 +86,7 @@ class Asked(Struct, kw_only=True):
 class _Work(Struct, frozen=True, kw_only=True):
     """What is being carried out for a sender."""
 
-    command: int
-    parameters: tuple[float, ...]
+    code: str
     running: asyncio.Task[None]
 
 
@@ -115,6 +126,20 @@ def parameters_of(message: Message) -> tuple[float, ...]:
     return tuple(float(getattr(message, f"param{number}")) for number in range(1, 8))
 
 
+def code_of(message: Message) -> str:
+    """Return what a command says, by which a repetition is known: its bytes, but for the count of repetitions.
+
+    Numbers are compared as they are sent: unused parameters are NaN, MAVLink's "not set", and NaN is not equal to NaN.
+    """
+    numbers = [getattr(message, f"param{number}") for number in range(1, 5)]
+    if message.get_type() == "COMMAND_INT":
+        raw = struct.pack("<HB4f2if", message.command, message.frame, *numbers, message.x, message.y, message.z)
+    else:
+        numbers += [message.param5, message.param6, message.param7]
+        raw = struct.pack("<H7f", message.command, *numbers)
+    return f"{message.get_type()} {message.target_system} {raw.hex()}"
+
+
 class RequestDesk:
     """Takes requests and answers them.
 
@@ -126,6 +151,7 @@ class RequestDesk:
         mission: returns the instruction and plan of a vehicle's mission, by the parameters of MISSION_START; None:
             none are taken here.
         reach: finds senders of before a restart, who are told how their tasks go on.
+        clock: seconds of the wall clock.
     """
 
     def __init__(
@@ -137,7 +163,9 @@ class RequestDesk:
         refused: dict[str, int],
         mission: Callable[[str, tuple[float, ...]], tuple[str, Plan]] | None = None,
         reach: Reach = lambda _sender, _system: None,
+        clock: Callable[[], float] = time.time,
     ) -> None:
+        self._clock = clock
         self._templates = {each.id: each for each in templates}
         self._tasks = tasks
         self._store = store
@@ -187,17 +215,14 @@ class RequestDesk:
             self._count("command_unsupported")
             self._answer(frame, reply, dialect.UNSUPPORTED)
             return
-        parameters = parameters_of(message)
+        code = code_of(message)
         at_work = self._at_work.get(sender)
         if at_work is not None:
             # A repetition while it is being carried out hears the same; anything else has to wait its turn.
-            same = (at_work.command, at_work.parameters) == (message.command, parameters)
-            self._answer(frame, reply, dialect.IN_PROGRESS if same else dialect.TEMPORARILY_REJECTED)
+            self._answer(frame, reply, dialect.IN_PROGRESS if at_work.code == code else dialect.TEMPORARILY_REJECTED)
             return
         last = self._last.get(sender)
-        repeated = message.command != CANCEL and bool(getattr(message, "confirmation", 0))
-        same = last is not None and (last.command, last.parameters) == (message.command, parameters)
-        again = last if repeated and same else None
+        again = last if last is not None and last.code == code and self._repeated(message, last) else None
         if again is not None and again.result is not None:
             self._reply(frame, reply, again)
             return
@@ -214,15 +239,25 @@ class RequestDesk:
         else:
             work = self._cancel(frame, reply, last, asker or f"{STATION}{sender}")
         running = asyncio.create_task(work, name=f"MAVLink request of {sender}")
-        self._at_work[sender] = _Work(command=message.command, parameters=parameters, running=running)
+        self._at_work[sender] = _Work(code=code, running=running)
         running.add_done_callback(lambda _: self._at_work.pop(sender, None))
+
+    def _repeated(self, message: Message, last: Asked) -> bool:
+        """Whether a command that says the same as the sender's last one is that again, and not another order."""
+        if message.command == CANCEL:
+            return False
+        if message.get_type() == "COMMAND_LONG":
+            return bool(message.confirmation)
+        return 0.0 <= self._clock() - last.at <= REPEAT_S
 
     # --- asking ------------------------------------------------------------------------------------------------
 
     async def _begin(self, sender: str, frame: Frame, reply: Callable[[Message], None], robot: str, asker: str) -> None:
         asked = Asked(
-            parameters=parameters_of(frame.message),
+            parameters=tuple(each if math.isfinite(each) else str(each) for each in parameters_of(frame.message)),
             task=f"m-{secrets.token_hex(6)}",
+            code=code_of(frame.message),
+            at=self._clock(),
             command=frame.message.command,
             system=frame.target_system,
         )
@@ -254,6 +289,7 @@ class RequestDesk:
             self._progress.forget(asked.task)
             self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
             log.warning("task by MAVLink is refused", sender=sender, reason=str(error))
+        asked.at = self._clock()
         try:
             if asked.result == dialect.TEMPORARILY_REJECTED:
                 await self._store.delete(PREFIX + sender)
@@ -265,15 +301,16 @@ class RequestDesk:
         self._reply(frame, reply, asked)
 
     def _request(self, asked: Asked, *, robot: str, submitter: str) -> TaskRequest:
+        parameters = tuple(float(each) for each in asked.parameters)
         if asked.command == MISSION and self._mission is not None:
-            text, plan = self._mission(robot, asked.parameters)
+            text, plan = self._mission(robot, parameters)
             return TaskRequest(instruction=text, id=asked.task, submitter=submitter, plan=plan)
-        number = asked.parameters[0]
+        number = parameters[0]
         template = self._templates.get(int(number)) if math.isfinite(number) else None
         if template is None:
             known = ", ".join(str(each) for each in sorted(self._templates)) or "none"
             raise PayloadError(f"no template {number:g}; known: {known}", remedy="add it to robots.templates")
-        text = instruction(template, asked.parameters, robot=robot)
+        text = instruction(template, parameters, robot=robot)
         return TaskRequest(instruction=text, id=asked.task, submitter=submitter)
 
     async def _cancel(self, frame: Frame, reply: Callable[[Message], None], last: Asked | None, by: str) -> None:
@@ -363,6 +400,7 @@ class RequestDesk:
             log.warning("the answer to a request could not be kept", sender=sender, reason=str(error))
 
     def _reply(self, frame: Frame, reply: Callable[[Message], None], asked: Asked) -> None:
+        asked.at = self._clock()  # this answer may be lost as the one before
         if asked.why:
             self._say(reply, asked.why, _ERROR)
         self._answer(frame, reply, asked.result or dialect.ACCEPTED, number=task_number(asked.task))
