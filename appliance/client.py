@@ -25,7 +25,7 @@ from appliance.pool.api import (
     Warmed,
 )
 from appliance.pool.transfer.api import Brought, FetchAsk
-from appliance.robots.api import LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk
+from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
 from appliance.steering import SteeringCalls
 from appliance.tasks.api import (
     AgreeAsk,
@@ -165,6 +165,18 @@ class FleetClient(SteeringCalls):
         """Have a gateway close a MAVLink link for good; NotFoundError when it has none of that name."""
         await self._known(gateway)
         return await self.plane.rpc.call(gateway, "robot_link_remove", ask, LinkFacts, timeout_s=15.0)
+
+    async def robot_forget(self, ask: RobotForget) -> Forgotten:
+        """Remove the row of a robot that is offline, at the gateway that it was attached to, where that is there.
+
+        Raises:
+            NotFoundError: there is none of that name.
+            RefusedError: it is online.
+        """
+        anyone = await self.gateway()
+        known = self.plane.registry.robots.get(ask.robot)
+        there = known is not None and known.gateway in self.plane.members()
+        return await self.plane.rpc.call(known.gateway if known and there else anyone, "robot_forget", ask, Forgotten)
 
     # --- pools ------------------------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
 from appliance.robot_tasks import RobotTasks
-from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk
+from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.authority.authority import SHOWN, Authority
 from appliance.robots.bounds import Orders
 from appliance.robots.hub import RobotHub
@@ -230,6 +230,7 @@ class Gateway:
             on_task=self._robot_tasks.take,
             tasks=self._robot_tasks.doors(),
             gate=self.authority.refuses,
+            roster=self.plane.registry.robots,
         )
         await self.hub.start()
         self._stack.push_async_callback(self.hub.stop)
@@ -237,6 +238,7 @@ class Gateway:
         rpc.register("robot_links", LinksAsk, self.hub.links)
         rpc.register("robot_link_add", LinkAdd, self.hub.add_link)
         rpc.register("robot_link_remove", LinkRemove, self.hub.remove_link)
+        rpc.register("robot_forget", RobotForget, self.hub.forget)
 
     async def _start_planner(self, catalogue: Catalogue) -> None:
         config, plane = self.config, self.plane

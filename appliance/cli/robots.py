@@ -13,7 +13,7 @@ from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, Exit, RefusedError, SwiftbotError
-from appliance.robots.api import LinkAdd, LinkFacts, LinkList, LinkRemove
+from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, RobotForget
 from appliance.robots.settings import MavlinkLink
 
 robots_app = App(name="robots", help="Robots: who there is, their MAVLink links, and buttons.", group=WORK)
@@ -38,6 +38,26 @@ def robots_list(*, as_json: Json = False, where: Where = HERE) -> int:
         show(found, as_json=as_json, table=console.robot_table(found))
 
     asyncio.run(go())
+    return 0
+
+
+@robots_app.command(name="forget")
+def robots_forget(robot: str, *, as_json: Json = False, where: Where = HERE) -> int:
+    """Remove the row of a robot that is offline; it comes back when it is heard again.
+
+    Args:
+        robot: Its name as the list shows it.
+    """
+
+    async def go() -> Forgotten:
+        async with FleetClient(where.endpoint()) as client:
+            return await client.robot_forget(RobotForget(robot=robot, by=_who()))
+
+    done = asyncio.run(go())
+    if as_json:
+        show(done, as_json=True)
+    else:
+        console.out.print(f"{done.gateway} has forgotten {done.robot}", markup=False)
     return 0
 
 

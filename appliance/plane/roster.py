@@ -49,7 +49,10 @@ class Roster:
     def _on_robot(self, key: str, info: RobotInfo | None) -> None:
         robot = key.split("/")[-2]
         if info is None:
-            self._lose(robot)
+            # Somebody removed its row: a robot that is merely gone is put as offline, or its token ends.
+            self._gone.pop(robot, None)
+            if self.robots.pop(robot, None) is not None:
+                self._on_change()
             return
         if info.id != robot:
             self._session.refuse("misplaced robot/*/state", key=key, says=info.id)

@@ -1,4 +1,4 @@
-"""What a gateway answers about its MAVLink links, and the orders by which they come and go at run time."""
+"""What a gateway answers about its MAVLink links and robots, and the orders by which they come and go at run time."""
 
 from msgspec import Struct, field
 
@@ -23,6 +23,22 @@ class LinkRemove(Struct, frozen=True, kw_only=True):
     url: str
     """As the list shows it."""
     by: str = ""
+
+
+class RobotForget(Struct, frozen=True, kw_only=True):
+    """Verb `robot_forget`: remove the row of a robot that is offline; it comes back when it is heard again."""
+
+    robot: str
+    by: str = ""
+    """Who wants it, for the log."""
+
+
+class Forgotten(Struct, frozen=True, kw_only=True):
+    """A robot whose row was removed."""
+
+    robot: str
+    gateway: str
+    """Which did it."""
 
 
 class SenderFacts(Struct, frozen=True, kw_only=True, omit_defaults=True):

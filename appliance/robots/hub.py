@@ -4,13 +4,15 @@ Zenoh robots speak for themselves and need nothing of a gateway; MAVLink vehicle
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from appliance.errors import NotFoundError
-from appliance.model import RobotCommand, Site, TaskRequest
+import structlog
+
+from appliance.errors import NotFoundError, RefusedError
+from appliance.model import RobotCommand, RobotInfo, Site, TaskRequest
 from appliance.plane.session import Session
-from appliance.robots.api import LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk
+from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.doors import Tasks
 from appliance.robots.intake import TaskIntake
 from appliance.robots.ledger import KeyValues
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from appliance.robots.mavlink.station import Station
 
 
+log = structlog.get_logger(__name__)
+
 ADDED_LINKS = "mavlink/links"
 """Where links added at run time are kept in the gateway's store."""
 
@@ -27,7 +31,7 @@ ADDED_LINKS = "mavlink/links"
 class RobotHub:
     """One per gateway. `refused` counts bad input by kind; `on_task` and `tasks` take what robots ask for.
 
-    `gate` says why a robot may not be given a command just now.
+    `gate` says why a robot may not be given a command just now; `roster` is what is known of the fleet's robots.
     """
 
     def __init__(
@@ -41,8 +45,10 @@ class RobotHub:
         on_task: Callable[[str, TaskRequest], None] | None = None,
         tasks: Tasks | None = None,
         gate: Callable[[str, RobotCommand], str] = lambda _, __: "",
+        roster: Mapping[str, RobotInfo] | None = None,
     ) -> None:
         self._config = config
+        self._roster: Mapping[str, RobotInfo] = {} if roster is None else roster
         self._gate = gate
         self._session = session
         self._store = store
@@ -107,6 +113,27 @@ class RobotHub:
         if self._station is None:
             raise NotFoundError(f"no MAVLink link {ask.url[:120]!r}", remedy="this gateway has none")
         return await self._station.links.remove(ask.url, by=ask.by)
+
+    async def forget(self, ask: RobotForget) -> Forgotten:
+        """Remove the row of a robot that is offline, here and in every roster: the verb robot_forget.
+
+        Raises:
+            NotFoundError: there is none of that name.
+            RefusedError: it is online, and would be back at once.
+        """
+        name = ask.robot[:120]
+        mine = name in self.attached
+        known = self._roster.get(name)
+        if not mine and known is None:
+            raise NotFoundError(f"no robot {name!r}", remedy="see `swiftbot robots`")
+        if (known is not None and known.online) or (self._station is not None and self._station.online(name)):
+            raise RefusedError(f"{name} is online", remedy="switch it off, or remove its link, first")
+        if self._station is not None:
+            await self._station.forget(name)
+        # A deleted key is what every roster knows a removed row by.
+        self._session.delete(self._session.keys.robot(name))
+        log.info("robot forgotten", robot=name, by=ask.by[:120])
+        return Forgotten(robot=name, gateway=self._gateway)
 
     async def stop(self) -> None:
         """End commands (the next process resumes them), take back what was declared, close the ports."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from robots_process import STATION, beats, gateway_process, read_frames
+from robots_process import STATION, beats, gateway_process, read_frames, swiftbot
 
 from appliance.robots.mavlink.dialect import Codec, make
 from appliance.robots.settings import RobotsConfig, Template
@@ -75,3 +75,33 @@ async def test_a_repeated_command_is_one_task(tmp_path: Path) -> None:
         assert len({each.result_param2 for each in first}) == 1
         assert len({each.result_param2 for each in both}) == 2
         assert len((await it.client.tasks(100)).tasks) == 2
+
+
+async def test_no_robot_of_senders_that_are_no_vehicle(tmp_path: Path) -> None:
+    """System 0, component 0 and a station that names an autopilot are not in the list; an old row can be removed."""
+    async with gateway_process(tmp_path) as it:
+        end = it.connect("udp", await it.link("udp"))
+        senders = [beats(*each) for each in ((7, 1), (0, 1), (0, 0), (5, 0), (255, 190))]
+
+        def act() -> None:
+            for beat in senders:
+                end.send(beat())
+
+        await it.until(lambda: it.robots().get("drone_7") and it.refused().get("no_sender", 0) > 5, act)
+        code, printed = await swiftbot(it.fleet, "robots", "list")
+        assert code == 0
+        assert "drone_7" in printed
+        assert not {"drone_0", "drone_5", "drone_255"} & set(it.robots())
+        code, printed = await swiftbot(it.fleet, "robots", "forget", "drone_7")
+        assert code != 0
+        assert "drone_7 is online" in printed
+        await it.until(lambda: not it.robots()["drone_7"].online)
+        code, printed = await swiftbot(it.fleet, "robots", "forget", "drone_7")
+        assert (code, "has forgotten drone_7" in printed) == (0, True), printed
+        await it.until(lambda: "drone_7" not in it.robots())
+        await asyncio.sleep(6.0)  # longer than rosters are reminded of vehicles that are offline
+        assert "drone_7" not in it.robots()
+        _, printed = await swiftbot(it.fleet, "robots", "list")
+        assert "drone_7" not in printed
+        assert (await swiftbot(it.fleet, "robots", "forget", "drone_7"))[0] != 0
+        await it.until(lambda: "drone_7" in it.robots() and it.robots()["drone_7"].online, act)

@@ -292,13 +292,29 @@ class Station:
         self._names.clear()
 
     async def _let_go(self, each: _Attached) -> None:
+        await self._end(each)
+        self._tell(each, "its link was removed")
+        log.info("vehicle let go", robot=each.vehicle.name)
+
+    async def _end(self, each: _Attached) -> None:
         await each.desk.close()
         for closer in (each.queryable, each.token):
             if closer is not None:
                 closer.close()
         each.vehicle.online = False
-        self._tell(each, "its link was removed")
-        log.info("vehicle let go", robot=each.vehicle.name)
+
+    def online(self, name: str) -> bool:
+        """Whether a vehicle of that name is online here."""
+        each = self._vehicles.get(name)
+        return each is not None and each.vehicle.online
+
+    async def forget(self, name: str) -> None:
+        """Forget a vehicle that is offline, if there is one of that name; heard again it is a new one."""
+        each = self._vehicles.pop(name, None)
+        if each is not None:
+            self._by_source = {source: one for source, one in self._by_source.items() if one is not each}
+            self._names.clear()
+            await self._end(each)
 
     def _announce(self, name: str, message: Message) -> None:
         """Send a message to a vehicle and to whoever else listens: ground stations, other routers."""

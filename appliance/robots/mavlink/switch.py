@@ -124,14 +124,18 @@ class Switch:
     def _receive(self, entry: OpenLink, frame: Frame, address: Address) -> None:
         now = self._loop.time()
         source = (frame.system, frame.component)
-        sender = entry.link.stats.sender(*source)
         end = entry.end(address)
+        if frame.system == 0:
+            # An address for all and nobody's own: what was learned of it would draw everybody's frames to one end.
+            self._refused["no_sender"] = self._refused.get("no_sender", 0) + 1
+            self.record(end, "", "rx", frame.raw)
+            return
         if self.router.repeated(frame.raw, now, sender=source):
-            sender.repeated += 1
+            entry.link.stats.sender(*source).repeated += 1
             self._refused["repeated"] = self._refused.get("repeated", 0) + 1
             self.record(end, self._name_of(frame, end), "rx", frame.raw)  # it goes no further, but it was heard
             return
-        sender.hear(frame.sequence, now)
+        entry.link.stats.sender(*source).hear(frame.sequence, now)
         self._on_frame(entry, frame, end, now)
 
     def hand_on(self, entry: OpenLink, frame: Frame, source: End, sender: Vehicle | None, now: float) -> None:

@@ -57,13 +57,20 @@ _HEARD = frozenset(
 """Messages that tell the vehicle's state."""
 
 
+_PERIPHERALS = 100
+"""Component ids from here on are those of cameras, gimbals, onboard computers and ground stations (MAV_COMPONENT)."""
+
+
 def is_autopilot(frame: Frame) -> bool:
     """Tell whether a frame is the heartbeat of an autopilot: not of a camera, a gimbal or a ground station.
 
-    Components share their vehicle's system id and beat too; the first one heard is often not the autopilot.
+    Components share their vehicle's system id and beat too; the first one heard is often not the autopilot. System and
+    component 0 are addresses for all, and no sender's own (MAVLink guide, "Routing").
     """
     return (
         frame.name == "HEARTBEAT"
+        and frame.system != 0
+        and 0 < frame.component < _PERIPHERALS
         and frame.message.autopilot != dialect.AUTOPILOT_NONE
         and frame.message.type != dialect.TYPE_GROUND_STATION
     )
