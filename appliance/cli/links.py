@@ -42,4 +42,5 @@ def _note(link: LinkFacts) -> str:
         said.append("added at run time")
     if link.problem:
         said.append(link.problem)
+    said += [f"a storm of {each} is damped" for each in link.damped]
     return ", ".join(said + [f"{kind} {count}" for kind, count in sorted(link.refused.items())])

@@ -91,6 +91,8 @@ class LinkFacts(Struct, frozen=True, kw_only=True, omit_defaults=True):
     out_bytes_s: float = 0.0
     refused: dict[str, int] = field(default_factory=dict[str, int])
     """Damaged and unbelieved frames, floods, and what could not be sent, by kind."""
+    damped: tuple[str, ...] = ()
+    """Messages that come in a storm just now and are cut, with their senders: `PARAM_VALUE of 1/1`."""
     senders: tuple[SenderFacts, ...] = ()
     latency: tuple[LatencyFacts, ...] = ()
     problem: str = ""

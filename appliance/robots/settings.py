@@ -142,6 +142,11 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Most frames a second from one other end of a link, with a burst of as many: a vehicle sends 50 to 500, a router
     with ten vehicles behind it ten times that. What more comes in datagrams is dropped and counted as `flood`, a
     stream is read more slowly; the other ends do not notice. 0: no limit."""
+    message_hz: float = 500.0
+    """Most frames a second of one message from one sender (system and component), with a burst of four seconds' worth:
+    what more comes is a storm, as of two programs that answer each other's answers. It is let through in a trickle
+    (4 %) until it is over, counted as `damped`, and told of once. Messages that carry files are excepted.
+    0: no limit."""
     repeat_s: float = 0.5
     """The same bytes within so long are a repetition, which came by two ways or round a ring of routers, and go no
     further. Such copies come within tenths of a second; some senders do say the same again after seconds."""
@@ -200,6 +205,7 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise ConfigError("robots.templates: an id is given twice", remedy="give each its own")
         for name, value in (
             ("sender_hz", self.sender_hz),
+            ("message_hz", self.message_hz),
             ("repeat_s", self.repeat_s),
             ("timesync_s", self.timesync_s),
         ):

@@ -3,12 +3,14 @@
 import asyncio
 import math
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
-from robots_process import STATION, beats, gateway_process, read_frames, swiftbot
+from robots_process import BEAT, STATION, beats, gateway_process, read_frames, swiftbot
 
+from appliance.model import Notice
 from appliance.robots.mavlink.dialect import Codec, make
 from appliance.robots.settings import RobotsConfig, Template
 
@@ -105,3 +107,57 @@ async def test_no_robot_of_senders_that_are_no_vehicle(tmp_path: Path) -> None:
         assert "drone_7" not in printed
         assert (await swiftbot(it.fleet, "robots", "forget", "drone_7"))[0] != 0
         await it.until(lambda: "drone_7" in it.robots() and it.robots()["drone_7"].online, act)
+
+
+async def test_a_storm_between_two_ends_is_damped_and_told_once(tmp_path: Path) -> None:
+    """Two programs answer each other's PARAM_VALUE through the gateway: it dies down, and users are told of it."""
+    async with gateway_process(tmp_path) as it:
+        notices: asyncio.Queue[Notice] = asyncio.Queue()
+        it.client.on_notice(notices)
+        port = await it.link("udp")
+        ends = {system: it.connect("udp", port) for system in (1, 2)}
+        codecs = {system: Codec(system, 1) for system in ends}
+        fields = {"param_id": b"X", "param_value": 1.0, "param_type": 9, "param_count": 1, "param_index": 0}
+        value = make("PARAM_VALUE", **fields)
+        counts: list[int] = []
+        began, beat_at = time.monotonic(), 0.0
+        ends[1].send(codecs[1].pack(value))
+        while time.monotonic() - began < 12.0:
+            for system, end in ends.items():
+                if time.monotonic() - beat_at > 0.5:
+                    end.send(codecs[system].pack(make("HEARTBEAT", **BEAT)))
+                    end.send(codecs[system].pack(value))
+                heard = [each for each in read_frames(end) if each.name == "PARAM_VALUE"]
+                counts += [int(time.monotonic() - began)] * len(heard)
+                for _ in range(2 * min(len(heard), 200)):  # each answer is answered twice
+                    end.send(codecs[system].pack(value))
+            beat_at = time.monotonic() if time.monotonic() - beat_at > 0.5 else beat_at
+            await asyncio.sleep(0.002)
+        each_second = Counter(counts)
+        assert max(each_second.values()) > 200, each_second
+        assert sum(each_second[second] for second in (8, 9, 10)) < 3 * 2 * 25, each_second
+        facts = await it.facts(port)
+        assert set(facts.damped) == {"PARAM_VALUE of 1/1", "PARAM_VALUE of 2/1"}
+        assert facts.refused["damped"] > 0
+        assert notices.qsize() == 2
+        assert all("storm of PARAM_VALUE" in notices.get_nowait().text for _ in range(2))
+        assert {name: each.online for name, each in it.robots().items()} == {"drone_1": True, "drone_2": True}
+        _, printed = await swiftbot(it.fleet, "robots", "links")
+        assert "damped" in printed
+
+
+async def test_simulated_vehicles_on_one_gateway_answer_for_themselves(tmp_path: Path) -> None:
+    """One PARAM_REQUEST_LIST to all of three simulated vehicles: each list once, and then silence."""
+    async with gateway_process(tmp_path, mavlink=3) as it:
+        await it.until(lambda: sum(each.online for each in it.robots().values()) == 3)
+        end = it.connect("udp", await it.link("udp"))
+        station = Codec(255, 190)
+        end.send(station.pack(make("HEARTBEAT", **STATION)))
+        end.send(station.pack(make("PARAM_REQUEST_LIST", target_system=0, target_component=0)))
+        values: list[tuple[int, str]] = []
+        for _ in range(60):
+            values += [(each.system, each.message.param_id) for each in read_frames(end) if each.name == "PARAM_VALUE"]
+            await asyncio.sleep(0.1)
+        assert {system for system, _ in values} == {1, 2, 3}
+        assert len(values) == len(set(values))
+        assert "damped" not in it.refused()

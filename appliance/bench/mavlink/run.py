@@ -145,7 +145,7 @@ class _Bench:
             listen=f"tcp/127.0.0.1:{zenoh}",
             store=str(folder / "store.sqlite"),
             # At full speed a second is some ten milliseconds, and so is the time within which frames are repetitions.
-            robots=RobotsConfig(mavlink=links, sender_hz=0.0, repeat_s=0.5 if speed else 0.005),
+            robots=RobotsConfig(mavlink=links, sender_hz=0.0, message_hz=0.0, repeat_s=0.5 if speed else 0.005),
             profile=profile,
         )
         order = folder / "host.json"

@@ -7,11 +7,14 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 
-from appliance.model import Site, TaskRecord, encode
+import structlog
+
+from appliance.model import Notice, Site, TaskRecord, encode
 from appliance.plane.session import Closer, Session
 from appliance.robots.api import LinkList
 from appliance.robots.doors import Tasks
 from appliance.robots.ledger import KeyValues
+from appliance.robots.mavlink.damping import Kind
 from appliance.robots.mavlink.dialect import Frame, Message, make
 from appliance.robots.mavlink.frames import MARKER_V2
 from appliance.robots.mavlink.letters import LetterDesk
@@ -24,6 +27,10 @@ from appliance.robots.mavlink.tunnel import PAYLOAD_TYPE
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import RobotsConfig
 
+log = structlog.get_logger(__name__)
+
+OPERATORS = "operator"
+"""Who is told of what goes wrong on links."""
 FRAME_ENCODING = "application/mavlink"
 _LINKS_S = 1.0
 """How often the links are told about."""
@@ -130,6 +137,13 @@ class Switch:
             self._refused["no_sender"] = self._refused.get("no_sender", 0) + 1
             self.record(end, "", "rx", frame.raw)
             return
+        kind = (*source, frame.name)
+        if not entry.damper.passes(kind, now):
+            entry.link.count("damped")
+            entry.link.stats.sender(*source).hear(frame.sequence, now)
+            if entry.damper.news(kind):
+                self._tell_storm(entry, kind)
+            return  # not recorded either: a storm must not fill the log
         if self.router.repeated(frame.raw, now, sender=source):
             entry.link.stats.sender(*source).repeated += 1
             self._refused["repeated"] = self._refused.get("repeated", 0) + 1
@@ -137,6 +151,20 @@ class Switch:
             return
         entry.link.stats.sender(*source).hear(frame.sequence, now)
         self._on_frame(entry, frame, end, now)
+
+    def _tell_storm(self, entry: OpenLink, kind: Kind) -> None:
+        system, component, name = kind
+        link = str(entry.setting.remote)
+        log.warning("a MAVLink message comes in a storm and is damped", link=link, message=name, system=system)
+        text = f"MAVLink: a storm of {name} from {system}/{component} on {link} is damped; see what answers it"
+        notice = Notice(
+            id=f"{self._gateway}/storm/{entry.number}/{system}-{component}/{name}/{time.time_ns()}",
+            to=OPERATORS,
+            text=text,
+            gateway=self._gateway,
+            at_ns=time.time_ns(),
+        )
+        self._session.put(self._session.keys.notice(OPERATORS), encode(notice))
 
     def hand_on(self, entry: OpenLink, frame: Frame, source: End, sender: Vehicle | None, now: float) -> None:
         """Take what is for the gateway, pass on the rest. `sender`: the vehicle whose system's frame it is."""

@@ -19,6 +19,7 @@ from appliance.model import encode
 from appliance.robots.api import LatencyFacts, LinkFacts, SenderFacts
 from appliance.robots.hub import ADDED_LINKS as KEY
 from appliance.robots.ledger import KeyValues
+from appliance.robots.mavlink.damping import Damper
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.keeping import load_signer, remember
 from appliance.robots.mavlink.kinds import KINDS, NAMES
@@ -47,6 +48,7 @@ class OpenLink(Struct, eq=False):
     setting: MavlinkLink
     link: Link
     added: bool
+    damper: Damper
     ends: dict[Address, End] = msgspec.field(default_factory=dict[Address, End])
     """Ends by address, so that none is made anew for each frame."""
 
@@ -177,7 +179,7 @@ class LinkTable:
         except BaseException:
             self._router.remove(number)
             raise
-        entry = self._links[number] = OpenLink(number, setting, link, added)
+        entry = self._links[number] = OpenLink(number, setting, link, added, Damper(self._config.message_hz))
         log.info("MAVLink link open", link=str(setting.remote), listens=setting.remote.listens, signed=bool(signer))
         return entry
 
@@ -285,6 +287,7 @@ class LinkTable:
         """One link as it is now."""
         stats, link = entry.link.stats, entry.link
         stats.look(now)
+        entry.damper.look(now)
         in_hz, in_bytes_s, out_hz, out_bytes_s = stats.meter.rates
         heard = sorted(stats.senders.items(), key=lambda each: -each[1].heard_at)[:MOST_TOLD]
         return LinkFacts(
@@ -303,6 +306,7 @@ class LinkTable:
             in_bytes_s=in_bytes_s,
             out_bytes_s=out_bytes_s,
             refused=dict(link.damaged),
+            damped=tuple(f"{name} of {system}/{component}" for system, component, name in sorted(entry.damper.damped)),
             senders=tuple(
                 SenderFacts(
                     system=system,

@@ -19,6 +19,7 @@ from appliance.robots.sim import orders
 from appliance.robots.sim.board import Board, Sender
 from appliance.robots.sim.flight import Flight, Point
 from appliance.robots.sim.ground import Ground
+from appliance.robots.sim.parameters import REQUESTS as PARAMETER_REQUESTS
 from appliance.robots.sim.parameters import Parameters
 from appliance.robots.sim.safety import Failsafes, arming_problems
 from appliance.robots.sim.telemetry import telemetry
@@ -103,14 +104,12 @@ class Autopilot(abc.ABC, Generic[Body]):
     def handle(self, frame: Frame, now: float) -> list[Message]:
         """Take in a message that may be for this vehicle; return the answers."""
         message = frame.message
-        if getattr(message, "target_system", self.system) not in (0, self.system):
-            return []
-        if getattr(message, "target_component", 0) not in (0, dialect.COMPONENT_AUTOPILOT):
+        if not self._meant(frame):
             return []
         sender = (frame.system, frame.component)
         if frame.name.startswith("MISSION_"):
             return self._mission_message(frame.name, message, sender, now)
-        if frame.name.startswith("PARAM_"):
+        if frame.name in PARAMETER_REQUESTS:
             return self.parameters.handle(frame.name, message)
         match frame.name:
             case "COMMAND_LONG" | "COMMAND_INT":
@@ -134,6 +133,15 @@ class Autopilot(abc.ABC, Generic[Body]):
             case _:
                 pass
         return self.drain()
+
+    def _meant(self, frame: Frame) -> bool:
+        """Whether a message is for this autopilot, and not from itself or another with its id."""
+        message = frame.message
+        return (
+            (frame.system, frame.component) != (self.system, dialect.COMPONENT_AUTOPILOT)
+            and getattr(message, "target_system", self.system) in (0, self.system)
+            and getattr(message, "target_component", 0) in (0, dialect.COMPONENT_AUTOPILOT)
+        )
 
     def _mission_message(self, name: str, message: Message, sender: Sender, now: float) -> list[Message]:
         board = self.board

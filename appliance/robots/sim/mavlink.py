@@ -206,6 +206,7 @@ class Simulation:
             if (
                 frame.name == "COMMAND_LONG"
                 and message.command == dialect.SET_INTERVAL
+                and message.target_system in (0, self._settings.system)
                 and message.target_component in (0, dialect.COMPONENT_AUTOPILOT)
             ):
                 self._set_interval(message)

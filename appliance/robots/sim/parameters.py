@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from appliance.robots.mavlink.dialect import Message, make
 
 _REAL32 = 9
+REQUESTS = frozenset(("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"))
+"""What is answered. PARAM_VALUE is an answer itself, and has no address: vehicles that answered it would not end."""
 PER_STEP = 12
 """Values sent at a time when all are asked for: a radio link carries no more."""
 
