@@ -63,11 +63,6 @@ exec_as_user() {
   )
   [ -z "$AS_ROOT" ] || environment=(-u TMPDIR -u TMP -u TEMP "${environment[@]}")
   [ ! -S "$RUNTIME_DIR/bus" ] || environment+=("DBUS_SESSION_BUS_ADDRESS=unix:path=$RUNTIME_DIR/bus")
-  if [ -n "$AS_ROOT" ]; then
-    environment+=("SWIFTBOT_SHARED=$BASE/work/shared")
-  elif [ -d "${SWIFTBOT_SHARED:-$PROJECT/../shared}" ]; then
-    environment+=("SWIFTBOT_SHARED=$(cd "${SWIFTBOT_SHARED:-$PROJECT/../shared}" && pwd -P)")
-  fi
   exec ${become[@]+"${become[@]}"} env "${environment[@]}" "$@"
 }
 

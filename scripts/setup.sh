@@ -269,18 +269,13 @@ copy_tree() {
   if command -v git >/dev/null && git -c safe.directory='*' -C "$PROJECT" ls-files -co --exclude-standard -z >"$LOG.files" 2>"$LOG"; then
     rsync -a --from0 --files-from="$LOG.files" --ignore-missing-args "$PROJECT/" "$staging/" >"$LOG" 2>&1 || fail "copying the tree" "see the lines above"
   else
-    rsync -a --exclude=/.git --filter=':- .gitignore' "$PROJECT/" "$staging/" >"$LOG" 2>&1 || fail "copying the tree" "see the lines above"
+    # rsync does not know the "!" of .gitignore: what it takes back is named here.
+    rsync -a --exclude=/.git --include='/tests/replay/logs/**.mcap' --filter=':- .gitignore' "$PROJECT/" "$staging/" >"$LOG" 2>&1 || fail "copying the tree" "see the lines above"
   fi
   rm -f "$LOG.files"
   rsync -a --delete --exclude=/.hypothesis --exclude=/.ruff_cache "${modes[@]}" "$staging/" "$TREE/" >"$LOG" 2>&1 ||
     fail "copying the tree to $TREE" "see the lines above"
   rm -rf "$staging"
-  local shared=${SWIFTBOT_SHARED:-$PROJECT/../shared}
-  if [ -d "$shared" ]; then
-    rsync -a --delete "${modes[@]}" "$shared/" "$BASE/work/shared/" >"$LOG" 2>&1 || fail "copying $shared" "see the lines above"
-  else
-    rm -rf "$BASE/work/shared"
-  fi
 }
 
 make_tools() {

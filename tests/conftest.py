@@ -1,7 +1,7 @@
-"""Fixtures that every test may use: the async backend, free ports, and the reference data beside the project.
+"""Fixtures that every test may use: the async backend, free ports, and the folder of the tests' data.
 
-They exist so that tests need nothing from outside themselves: ports are asked of the kernel, never fixed, and a
-missing reference file is a failure that says how to get it, never a silent skip.
+They exist so that tests need nothing from outside the project: ports are asked of the kernel, never fixed, and all data
+lies in `tests/data` or in the package.
 """
 
 import asyncio
@@ -136,10 +136,6 @@ def project_root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
-    """Return the folder of reference data (`../shared`, or $SWIFTBOT_SHARED); the test fails where there is none."""
-    named = os.environ.get("SWIFTBOT_SHARED", "")
-    folder = Path(named) if named else ROOT.parent / "shared"
-    if not folder.is_dir():
-        pytest.fail(f"reference data not found at {folder}: put it beside the project, or set SWIFTBOT_SHARED to it")
-    return folder
+def data() -> Path:
+    """Return the folder of the tests' data, `tests/data`; its README says where they are from."""
+    return ROOT / "tests" / "data"

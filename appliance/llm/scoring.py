@@ -1,7 +1,7 @@
 """How near a plan is to the right one: the figures that plans are judged by wherever they are trained or measured.
 
-The definitions are those of the shared scorer of decompositions (`shared/decomposition/score.py`), which a gateway does
-not have; the tests hold the two to the same figures. Subtasks are matched by skill, so that most of their parameters
+The definitions are those of the reference scorer (`appliance/bench/plan/cases/score.py`), and the tests hold
+the two to the same figures. Subtasks are matched by skill, so that most of their parameters
 agree (the robot is one). From that follow: `subtask_f1`; `decomposition`, F1 of the pairs "this before that", direct or
 not; `parallel_recall`, the share of independent pairs that were left independent; `param_f1`; `exact`, all of it right;
 `domain`; `valid`, whether it is a plan at all.

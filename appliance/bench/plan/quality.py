@@ -10,7 +10,6 @@ cases put to the real cascade with the upstream stand-in, several at a time.
 
 import asyncio
 import importlib.util
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,7 +31,6 @@ from appliance.model import Plan, Tier
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 Progress = Callable[[str], None]
-_REPOSITORY = Path(__file__).resolve().parents[3]
 AT_ONCE = 16
 """Cases at a time that the real cascade is given: most of them wait for the stand-in."""
 
@@ -47,9 +45,8 @@ class Case(Struct, frozen=True):
 
 
 def default_cases() -> Path:
-    """Return where the development set is expected: `$SWIFTBOT_SHARED` or `../shared`, `decomposition/dev.jsonl`."""
-    named = os.environ.get("SWIFTBOT_SHARED", "")
-    return (Path(named) if named else _REPOSITORY.parent / "shared") / "decomposition" / "dev.jsonl"
+    """Return the development set, which comes with the package, its scorer beside it."""
+    return Path(__file__).parent / "cases" / "dev.jsonl"
 
 
 async def run(
@@ -218,9 +215,7 @@ def _read(path: Path) -> list[Case]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise NotFoundError(
-            f"no cases at {path}: {error.strerror}", remedy="name a JSONL file of cases, or set SWIFTBOT_SHARED"
-        ) from error
+        raise NotFoundError(f"no cases at {path}: {error.strerror}", remedy="name a JSONL file of cases") from error
     found: list[Case] = []
     for number, line in enumerate(lines, start=1):
         if line.strip():

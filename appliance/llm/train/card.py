@@ -61,7 +61,7 @@ def model_card(
             f"from scratch; {precision} weights, {made['megabytes']} MB.",
             "",
             "- **Data**: the hand-written pairs of `appliance/llm/corpus`, varied while training, and in a tuned one",
-            "  a site's own. Neither the shared development cases nor any other test data.",
+            "  a site's own. Neither the development cases nor any other test data.",
             f"- **Training**: {figures.get('step', '?')} steps; {settings}.",
             "- **Second opinion** (`evidence.bin`): a linear classifier of the skills that words speak for, trained on",
             "  the same pairs; it has a say in which of several answers is given.",

@@ -10,9 +10,9 @@ from appliance.errors import NotFoundError, PayloadError
 pytestmark = pytest.mark.anyio
 
 
-async def test_rules_on_the_development_set(shared: Path) -> None:
+async def test_rules_on_the_development_set() -> None:
     """Rules alone keep their level: good on all cases, nearly right where they are sure enough to be carried out."""
-    result = await run(shared / "decomposition" / "dev.jsonl")
+    result = await run()
     assert result["all"]["cases"] == 120
     assert result["all"]["valid"] >= 95
     assert result["all"]["decomposition"] >= 90

@@ -46,9 +46,9 @@ def test_what_ends_in_nothing_is_lost() -> None:
     assert len(set(INSTRUCTIONS)) == len(INSTRUCTIONS)
 
 
-async def test_the_real_cascade_with_a_stand_in(shared) -> None:  # type: ignore[no-untyped-def]
+async def test_the_real_cascade_with_a_stand_in() -> None:
     """The same cases through the real cascade: what the rules were not sure of is answered by the stand-in."""
-    result = await run(shared / "decomposition" / "dev.jsonl", limit=12)
+    result = await run(limit=12)
     assert "rules" in result["routed_on"]
     assert "no local model" in result["routed_on"]
     escalated = [each["escalated"] for each in result["curve"]]

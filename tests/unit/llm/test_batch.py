@@ -110,14 +110,14 @@ async def test_what_cannot_be_done_is_said_before_anything_is_written(tmp_path: 
     assert other.read_text() == "this is\nsomething else\n"
 
 
-async def test_the_shared_scorer_takes_the_output(tmp_path: Path, catalogue: Catalogue, shared: Path) -> None:
+async def test_the_scorer_takes_the_output(tmp_path: Path, catalogue: Catalogue) -> None:
     """Predictions of the rules for a part of the development set are scored without complaint."""
-    from appliance.bench.plan.quality import _scorer  # noqa: PLC0415 - the scorer is loaded as the benchmark does
+    from appliance.bench.plan.quality import _scorer, default_cases  # noqa: PLC0415 - the scorer is loaded as the benchmark does
 
-    lines = (shared / "decomposition" / "dev.jsonl").read_text().splitlines()[:20]
+    lines = default_cases().read_text().splitlines()[:20]
     cases, out = written(tmp_path / "cases.jsonl", *lines), tmp_path / "out.jsonl"
     await batch.run(cases, out, config=LlmConfig(), catalogue=catalogue, tier="rules")
-    score = _scorer(shared / "decomposition" / "score.py")
+    score = _scorer(default_cases().with_name("score.py"))
     by_id = {row["id"]: row for row in rows(out)}
     figures = [score.score_case(case, by_id[case["id"]]) for case in map(json.loads, lines)]
     assert all(each["valid"] == 1.0 for each in figures)

@@ -1,13 +1,13 @@
 """The hand-written training pairs: the notation, what the checker finds, and that every pair passes it."""
 
 import json
-from pathlib import Path
 
 import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from appliance.bench.plan import default_cases
 from appliance.errors import PayloadError
 from appliance.llm.corpus import load
 from appliance.llm.corpus.__main__ import main
@@ -154,10 +154,10 @@ def test_every_pair_keeps_the_rules(corpus: dict[str, Pair], catalogue: Catalogu
     assert {name: found for name, pair in corpus.items() if (found := problems(pair, catalogue))} == {}
 
 
-def test_no_pair_copies_another_or_a_test_case(corpus: dict[str, Pair], shared: Path) -> None:
+def test_no_pair_copies_another_or_a_test_case(corpus: dict[str, Pair]) -> None:
     """No instruction is near a development case, which are for testing only, nor near another of the corpus."""
     cases: dict[str, tuple[str, list[Subtask]]] = {}
-    for line in (shared / "decomposition" / "dev.jsonl").read_text().splitlines():
+    for line in default_cases().read_text().splitlines():
         case = json.loads(line)
         cases[case["id"]] = (case["instruction"], msgspec.convert(case["gold"]["subtasks"], list[Subtask]))
     assert list(too_near(_plans(corpus), cases)) == []

@@ -1,4 +1,4 @@
-"""Plans are scored as the shared scorer scores them, whatever is wrong with them."""
+"""Plans are scored as the reference scorer scores them, whatever is wrong with them."""
 
 import copy
 import json
@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from appliance.bench.plan import default_cases
 from appliance.llm import corpus
 from appliance.llm.corpus.notation import parse
 from appliance.llm.language.codec import read
@@ -62,9 +63,9 @@ def damaged(plan: dict[str, Any], rng: random.Random) -> dict[str, Any]:
 
 
 @pytest.mark.thorough
-def test_it_is_the_shared_scorer_s_figures(shared: Path) -> None:
-    """Of hand-written plans with things wrong at random every figure is the shared scorer's, those of no plan too."""
-    theirs: Any = runpy.run_path(str(shared / "decomposition" / "score.py"))["score_case"]
+def test_it_is_the_reference_scorer_s_figures() -> None:
+    """Of hand-written plans with things wrong at random every figure is the reference scorer's, of no plan too."""
+    theirs: Any = runpy.run_path(str(default_cases().with_name("score.py")))["score_case"]
     catalogue, rng = load_catalogue(), random.Random(5)  # noqa: S311 - what is wrong, not secrets
     files = sorted(Path(corpus.__file__).parent.glob("*.plan"))
     pairs = [pair for file in files for pair in parse(file.read_text(), name=file.name).values()]

@@ -11,9 +11,9 @@ from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import Remote
 
 
-def test_a_real_dive_is_read_whole(shared: Path) -> None:
+def test_a_real_dive_is_read_whole(data: Path) -> None:
     """All 35,916 frames of a real ArduSub dive are read or counted as damaged (4), and the vehicle's state follows."""
-    data = (shared / "data/mavlink/ardusub-4.1.1-small.tlog").read_bytes()
+    log = (data / "mavlink/ardusub-4.1.1-small.tlog").read_bytes()
     names: Counter[str] = Counter()
     vehicle = Vehicle("sub", site=Site(), send=lambda _: None)
     modes: set[bool] = set()
@@ -26,12 +26,12 @@ def test_a_real_dive_is_read_whole(shared: Path) -> None:
 
     link = UdpServer(Remote("udp", "127.0.0.1", 0, True), Codec(245, 191), heard)
     at = records = 0
-    while at < len(data):
-        (stamp,) = struct.unpack_from(">Q", data, at)
-        length = frame_length(data, at + 8)
+    while at < len(log):
+        (stamp,) = struct.unpack_from(">Q", log, at)
+        length = frame_length(log, at + 8)
         assert length is not None
         assert 1_600_000_000 < stamp / 1e6 < 1_800_000_000
-        link.feed(data[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
+        link.feed(log[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
         records += 1
         at += 8 + length
     assert records == 35_916
@@ -43,9 +43,9 @@ def test_a_real_dive_is_read_whole(shared: Path) -> None:
     assert modes == {False, True}
 
 
-def test_the_same_bytes_as_one_stream(shared: Path) -> None:
+def test_the_same_bytes_as_one_stream(data: Path) -> None:
     """Read as one run of bytes, time stamps between the frames are noise and nearly every frame is found."""
-    data = (shared / "data/mavlink/ardusub-4.1.1-small.tlog").read_bytes()
-    found = list(Codec(245, 191).read(data))
+    log = (data / "mavlink/ardusub-4.1.1-small.tlog").read_bytes()
+    found = list(Codec(245, 191).read(log))
     frames = [each for each in found if isinstance(each, Frame)]
     assert len(frames) > 0.99 * 35_912

@@ -22,9 +22,9 @@ MODULES_OF = {"base": set[str](), "vision": {"numpy", "PIL"}}
 
 
 @pytest.fixture(scope="module")
-def reference(shared: Path) -> dict[str, Any]:
+def reference(data: Path) -> dict[str, Any]:
     """Return the reference catalogue."""
-    return json.loads((shared / "decomposition" / "catalogue.json").read_text())
+    return json.loads((data / "catalogue.json").read_text())
 
 
 def test_it_has_the_reference_skills_exactly(reference: dict[str, Any]) -> None:
