@@ -161,3 +161,34 @@ async def test_simulated_vehicles_on_one_gateway_answer_for_themselves(tmp_path:
         assert {system for system, _ in values} == {1, 2, 3}
         assert len(values) == len(set(values))
         assert "damped" not in it.refused()
+
+
+async def test_a_station_that_sends_no_heartbeat_is_served(tmp_path: Path) -> None:
+    """Its requests reach the vehicle on another link, the vehicle's words reach it, and its command becomes a task."""
+    templates = (Template(id=1, instruction="go to dock 3"),)
+    async with gateway_process(tmp_path, RobotsConfig(templates=templates)) as it:
+        vehicle, ground = it.connect("udp", await it.link("udp")), it.connect("tcp", await it.link("tcp"))
+        beat, station = beats(1), Codec(255, 190)
+        await it.until(lambda: "drone_1" in it.robots(), lambda: vehicle.send(beat()))
+        heard: list[Any] = []
+        asked = make("PARAM_REQUEST_LIST", target_system=1, target_component=1)
+        await it.until(
+            lambda: any(each.name == "PARAM_REQUEST_LIST" for each in read_frames(vehicle)),
+            lambda: ground.send(station.pack(asked)),
+        )
+
+        def told(name: str) -> list[Any]:
+            heard.extend(read_frames(ground))
+            return [each.message for each in heard if each.name == name]
+
+        await it.until(
+            lambda: any(each.get_srcSystem() == 1 for each in told("HEARTBEAT")), lambda: vehicle.send(beat())
+        )
+        numbers = {f"param{number}": 0.0 for number in range(2, 8)}
+        order = {"target_system": 242, "target_component": 191, "command": 31010, "confirmation": 0, "param1": 1.0}
+        ground.send(station.pack(make("COMMAND_LONG", **order, **numbers)))
+        await it.until(lambda: any(each.result == 0 for each in told("COMMAND_ACK")))
+        assert len((await it.client.tasks(100)).tasks) == 1
+        assert set(it.robots()) == {"drone_1"}
+        lists, _ = await it.client.robot_links(it.gateway)
+        assert "255/190" in lists[it.gateway].routes

@@ -1,8 +1,8 @@
 """Storms of one message: found by its rate, let through in a trickle, told of once. Pure, the clock passed in.
 
 Two programs that answer each other's answers never end, and each further one doubles what is sent: three vehicles that
-took PARAM_VALUE for a question sent 45,000 a second. A gateway cannot tell such a message from one that is wanted, but no
-message is wanted at such a rate, so what it passes on is cut until nearly nothing more comes.
+took PARAM_VALUE for a question sent 45,000 a second. A gateway cannot tell such a message from one that is wanted, but
+no message is wanted at such a rate, so what it passes on is cut until nearly nothing more comes.
 """
 
 from collections import OrderedDict

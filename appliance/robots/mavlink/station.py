@@ -80,6 +80,8 @@ class Station:
         self._by_source: dict[tuple[int, int], _Attached] = {}
         self._guests: set[tuple[int, int]] = set()
         """Link and system of ground stations and the like."""
+        self._turned_away: set[tuple[int, int, int]] = set()
+        """Link, system and component of autopilots that may not be robots here."""
         self._names: dict[End, tuple[str, ...]] = {}
         """Vehicles at ends, worked out when first asked for."""
         self._switch = Switch(
@@ -162,6 +164,11 @@ class Station:
             return
         if each is None:
             each = self._welcome(entry, frame, source)
+            sender = (entry.number, frame.system, frame.component)
+            if each is not None:
+                self._turned_away.discard(sender)
+            elif is_autopilot(frame):
+                self._turned_away.add(sender)
             if each is None:
                 self._switch.record(source, "", "rx", frame.raw)
                 return
@@ -196,17 +203,29 @@ class Station:
         return each.vehicle.name if each is not None and each.end == source else ""
 
     def _is_guest(self, entry: OpenLink, frame: Frame) -> bool:
-        """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer."""
+        """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer.
+
+        Any frame tells that it is there: some stations never beat. A vehicle whose first heartbeat has not come yet is
+        routed as a guest; one that may not be a robot here is none, nor is another with the address of one that is.
+        """
         if not self._config.route or frame.system == self._config.system_id:
             return False
-        if frame.name == "HEARTBEAT":
-            if not is_autopilot(frame):  # or a ground station with an autopilot of no kind, as some routers beat
-                if (entry.number, frame.system) not in self._guests:
-                    self._guests.add((entry.number, frame.system))
-                    log.info("MAVLink guest", link=str(entry.setting.remote), system=frame.system)
-                return True
-            self._guests.discard((entry.number, frame.system))  # a vehicle whose camera or radio was heard first
-        return (entry.number, frame.system) in self._guests
+        guest, sender = (entry.number, frame.system), (entry.number, frame.system, frame.component)
+        if is_autopilot(frame):
+            self._guests.discard(guest)
+            return False
+        if sender in self._turned_away or self._is_address_of_ours(frame):
+            return False
+        if guest not in self._guests:
+            self._guests.add(guest)
+            log.info("MAVLink guest", link=str(entry.setting.remote), system=frame.system)
+        return True
+
+    def _is_address_of_ours(self, frame: Frame) -> bool:
+        return any(
+            (each.vehicle.system, each.vehicle.component) == (frame.system, frame.component)
+            for each in self._by_source.values()
+        )
 
     def _watch_sticks(self, frame: Frame, now: float) -> None:
         """Notice a person who takes a vehicle over the gateway."""
@@ -280,6 +299,7 @@ class Station:
     def _link_gone(self, entry: OpenLink) -> None:
         """Let the vehicles of a link that was removed go: they may come back over another."""
         self._guests = {(number, system) for number, system in self._guests if number != entry.number}
+        self._turned_away = {each for each in self._turned_away if each[0] != entry.number}
         for number, system in [source for source in self._early if source[0] == entry.number]:
             del self._early[number, system]
         for (number, system), each in list(self._by_source.items()):

@@ -40,17 +40,17 @@ async def test_no_sender_that_is_none_makes_a_robot(kind: str) -> None:
         assert all(each.system for link in made.link_list().links for each in link.senders)
 
 
-async def test_a_real_flight_makes_one_robot(shared: Path) -> None:
+async def test_a_real_flight_makes_one_robot(data: Path) -> None:
     """A log with a submarine, its companion computer, its camera manager and its ground station: one robot."""
-    data = (shared / "data/mavlink/ardusub-4.1.1-small.tlog").read_bytes()
+    log = (data / "mavlink/ardusub-4.1.1-small.tlog").read_bytes()
     for route in (True, False):
         async with station(free_port(socket.SOCK_DGRAM), sender_hz=0.0, route=route) as (made, _):
             (entry,) = tuple(made.links)
             cast("Any", entry.link)._write = lambda *_: True
             at = 0
-            while at < len(data):
-                length = frame_length(data, at + 8) or 0
-                entry.link.feed(data[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
+            while at < len(log):
+                length = frame_length(log, at + 8) or 0
+                entry.link.feed(log[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
                 at += 8 + length
             assert made.attached == ("drone_1",)
 
