@@ -40,8 +40,9 @@ from appliance.tasks.replay import ReplayReport
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
 
-out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-err = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
+# No text of a user is markup: an instruction may hold "[/red]".
+out = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = Console(stderr=True, highlight=False, markup=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
 
 _STYLES = {
     SubtaskState.WAITING: "dim",
@@ -106,6 +107,30 @@ def plan_graph(plan: Plan) -> Group:
         style="bold",
     )
     return Group(head, table)
+
+
+def held_text(record: TaskRecord) -> Group:
+    """A plan that waits for approval: what it does, why it waits, how to approve it, until when."""
+    proposal = record.proposal
+    if proposal is None:
+        return Group(Text(""))
+    left = f" within {proposal.expires_s:.0f} s, else it fails" if proposal.expires_s else ""
+    lines = [
+        f"task {record.id} waits for approval{left}: {proposal.note}",
+        f"approve: swiftbot task approve {record.id} --hash {proposal.hash[:12]}",
+        f"reject:  swiftbot task reject {record.id}",
+    ]
+    return Group(plan_graph(proposal.plan), Text("\n".join(lines)))
+
+
+def asked(question: str) -> bool:
+    """Ask on the terminal; whether the answer is yes."""
+    try:
+        answer = out.input(f"{question} [y/N] ")
+    except (EOFError, KeyboardInterrupt):
+        out.print()
+        return False
+    return answer.strip().lower() in ("y", "yes")
 
 
 def plan_answer(answer: PlanAnswer) -> Group:

@@ -20,7 +20,11 @@ def provenance_text(found: Provenance) -> Text:
         f"{f': {each.problems[0]}' if each.problems else ''}"
         for each in found.attempts
     ]
-    lines += [f"waits for an operator: {each}" for each in found.confirm]
+    lines += [
+        f"{'held' if each.severity == 'hold' else each.severity}: {each.message} [{each.check}]"
+        f"{f'; hint: {each.hint}' if each.hint else ''}"
+        for each in found.findings
+    ]
     return Text("\n".join(lines))
 
 
@@ -68,5 +72,5 @@ def experience_table(found: ExperienceList) -> Group:
             row.why or "–",
         )
     moved = ", ".join(f"{tier} {value:.2f}" for tier, value in found.thresholds.items())
-    tail = Text(f"plans are taken from: {moved or '–'}; below {found.confirm_below:.2f} they wait for an operator")
+    tail = Text(f"plans run unasked from: {moved or '–'}")
     return Group(Text(f"as {found.gateway} has heard", style="bold"), table, tail)

@@ -31,24 +31,37 @@ def plan(
     ] = "auto",
     model: Annotated[str, Parameter(help="Of a batch: folder of the local model.")] = "",
     config: Annotated[Path | None, Parameter(help="Of a batch: a gateway's file, for [llm] and [safety].")] = None,
+    site: Annotated[
+        str,
+        Parameter(help="Of a batch: the site whose places, objects, fence and limits count; a name or TOML file."),
+    ] = "",
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
     """Decompose an instruction and print the plan with what it asks for; nothing is run.
 
-    With --batch and --out each case `{"id", "instruction", "robots"?}` gets a line with plan, tier, confidence and
-    latency. Ctrl-C keeps what is written, and the same command goes on. Lines that are no case are told with their
-    numbers and end the command with exit code 4.
+    With --batch and --out each case `{"id", "instruction", "robots"?}` gets a line with plan, tier, confidence, latency,
+    `decision` (run, hold, refuse, stop) and the checks that spoke. Ctrl-C keeps what is written, and the same command
+    goes on. Lines that are no case are listed with their numbers and end the command with exit code 4.
     """
     if batch is not None or out is not None:
         if batch is None or out is None or text:
             raise ConfigError("a batch needs --batch and --out, and no text", remedy="see `swiftbot plan --help`")
-        return _batch(batch, out, tier, model, config, as_json=as_json)
+        return _batch(batch, out, tier, model, config, site, as_json=as_json)
     if not text:
         raise ConfigError("there is no instruction", remedy='such as: swiftbot plan "Robot_1: go to goal 2"')
 
+    from appliance.llm.stop_words import stop_request
+
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
+            await client.gateway()
+            stop = stop_request(text, tuple(client.plane.registry.robots))
+            if stop is not None:
+                who = " ".join(stop.robots)
+                told = f"a stop, not a task{f' of {who}' if who else ''}: swiftbot stop {who}".rstrip()
+                show({"decision": "stop", "robots": stop.robots}, as_json=as_json, table=told)
+                return
             answer = await client.plan(text, private=private)
         show(answer, as_json=as_json, table=console.plan_answer(answer))
 
@@ -56,13 +69,14 @@ def plan(
     return 0
 
 
-def _batch(cases: Path, out: Path, tier: str, model: str, config: Path | None, *, as_json: bool) -> int:
+def _batch(cases: Path, out: Path, tier: str, model: str, config: Path | None, site: str, *, as_json: bool) -> int:
     from msgspec.structs import replace
 
     from appliance.config import load
     from appliance.llm.batch import Choice, Report, run
     from appliance.llm.settings import LlmConfig
     from appliance.skills.catalogue import load_catalogue
+    from appliance.skills.sites import load_site
 
     read = load(config) if config is not None else None
     llm = read.llm if read is not None else LlmConfig()
@@ -76,8 +90,9 @@ def _batch(cases: Path, out: Path, tier: str, model: str, config: Path | None, *
     async def go() -> Report:
         safety = read.safety if read is not None else None
         return await run(
-            cases, out, config=llm, catalogue=load_catalogue(skills), tier=choice, safety=safety, progress=told
-        )
+            cases, out, config=llm, catalogue=load_catalogue(skills), tier=choice, safety=safety,
+            site=load_site(site) if site else None, progress=told,
+        )  # fmt: skip
 
     try:
         report = asyncio.run(go())

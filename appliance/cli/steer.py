@@ -149,17 +149,30 @@ def stop(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE
     """Soft stop: robots hold, and are given no command until `resume`; none named: the whole fleet.
 
     Commands in flight are cancelled and the tasks that need the robots are paused. It survives restarts of gateways.
-    It is no safety-rated emergency stop: that is a switch at the robot. Exit code 1 when somebody did not confirm, a
-    robot that is offline too: it could not be told, and is told when it is back.
+    It is no safety-rated emergency stop: that is a switch at the robot. Exit code 1 when a robot did not confirm, one
+    that is offline too: it is stopped when it is back. A name that no robot has stops nothing, and is reported first.
     """
+    return carry_out_stop(robots, why=why, as_json=as_json, where=where)
 
-    async def go() -> StopAnswer:
+
+def carry_out_stop(names: tuple[str, ...], *, why: str, as_json: bool, where: Where) -> int:
+    """Stop the robots that are there, all when none is named; print what came of it, the unknown names first."""
+    from appliance.stopping import Stopped, unknown_text
+
+    async def go() -> Stopped:
         async with FleetClient(where.endpoint()) as client:
-            return await client.stop(robots, why=why)
+            return await Stopped.carry_out(client, names, why=why)
 
-    answer = asyncio.run(go())
-    show(answer, as_json=as_json, table=_told(answer))
-    return Exit.FAILED if answer.silent or answer.problems else Exit.DONE
+    done = asyncio.run(go())
+    lines = [unknown_text(name, done.roster) for name in done.unknown]
+    if done.answer is not None:
+        lines.append(_told(done.answer, asked=done.robots))
+    elif done.unknown:
+        lines.append("no robot was stopped; to stop all of them: swiftbot stop")
+    show(done.as_json(), as_json=as_json, table="\n".join(lines))
+    if done.unknown:
+        return Exit.REFUSED
+    return Exit.FAILED if done.answer is None or done.answer.silent or done.answer.problems else Exit.DONE
 
 
 def resume(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE) -> int:
@@ -174,8 +187,14 @@ def resume(*robots: str, why: Why = "", as_json: Json = False, where: Where = HE
     return Exit.FAILED if answer.silent else Exit.DONE
 
 
-def _told(answer: StopAnswer) -> str:
-    lines = [f"{', '.join(each.robots) or 'the fleet'}: {each.text}" for each in answer.stops] or ["nothing is stopped"]
+def _told(answer: StopAnswer, *, asked: tuple[str, ...] | None = None) -> str:
+    lines: list[str] = []
+    if asked is not None and (answer.silent or answer.problems):
+        lost = ", ".join(sorted(answer.problems)) or f"gateways {', '.join(answer.silent)}"
+        lines.append(f"NOT CONFIRMED by {lost}: use the switch at the robot if it moves")
+    lines += [f"{', '.join(each.robots) or 'the fleet'}: {each.text}" for each in answer.stops] or [
+        "nothing is stopped"
+    ]
     if answer.robots:
         lines.append(f"hold: {', '.join(answer.robots)}")
     lines += [f"{robot} did not confirm: {reason}" for robot, reason in sorted(answer.problems.items())]

@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+import sys
 import uuid
 from pathlib import Path
 from typing import Annotated
@@ -15,9 +16,10 @@ from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import Endpoint, FleetClient
 from appliance.connection import operator_name
 from appliance.console_watch import stream_line
-from appliance.errors import ConfigError, Exit, NotFoundError, SwiftbotError
-from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
+from appliance.errors import ConfigError, Exit, NotFoundError, SwiftbotError, UnreachableError
+from appliance.model import PLAIN_PRIORITY, Approval, Plan, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
+from appliance.tasks.api import PlanAnswer
 from appliance.tasks.view import view
 
 task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agree to new plans.", group=WORK)
@@ -50,11 +52,30 @@ def submit(
     approval: Annotated[
         Approval, Parameter(help="Whether its plan is to be approved before anything runs (`task approve`).")
     ] = Approval.NEVER,
+    yes: Annotated[
+        bool, Parameter(name=("--yes", "-y"), negative="", help="Run the plan without showing it first.")
+    ] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
-    """Hand in an instruction; without --wait it returns when the task is planned."""
+    """Submit an instruction. Returns once planned; --wait follows it.
+
+    On a terminal the plan is shown before it runs, and runs when it is confirmed; in scripts the policy of the fleet
+    decides which plans wait for approval. A text that says to stop ("stop", "halt", "rover_1: stop") is no task: it is
+    the soft stop, at once, of the robots named, else of all.
+    """
+    from appliance.cli.steer import carry_out_stop
     from appliance.demo import follow
+    from appliance.llm.stop_words import mentions_stop, stop_request
+
+    if mentions_stop(text) and (stop := stop_request(text, _roster(where))) is not None:
+        return carry_out_stop((*stop.robots, *stop.unknown), why=text, as_json=as_json, where=where)
+    plan = None
+    if not yes and not as_json and sys.stdin.isatty() and sys.stdout.isatty():
+        plan = _confirmed(text, where)
+        if plan is None:
+            console.err.print("nothing was submitted")
+            return Exit.CANCELLED
 
     # The id is chosen here: an interrupt while the task is being handed in must know what to cancel.
     request = TaskRequest(
@@ -65,6 +86,7 @@ def submit(
         deadline_s=deadline,
         group=group,
         approval=approval,
+        plan=plan,
     )
 
     async def go() -> TaskRecord:
@@ -72,8 +94,11 @@ def submit(
             try:
                 accepted = await client.submit(request)
                 console.err.print(f"task {accepted.id} is accepted")
+                planned = await client.planned(accepted.id)
+                if planned.state is TaskState.PROPOSED and planned.proposal is not None:
+                    console.err.print(console.held_text(planned))
                 if not wait:
-                    return await client.planned(accepted.id)
+                    return planned
                 if not as_json:
                     return await follow(client, accepted.id)
                 last = accepted
@@ -89,6 +114,33 @@ def submit(
     if as_json or not wait:
         show(view(record), as_json=as_json, table=console.task_table(record))
     return _outcome(record)
+
+
+def _roster(where: Where) -> tuple[str, ...]:
+    """The robots that the fleet knows, by which a stop in words names them; none when the fleet does not answer."""
+
+    async def go() -> tuple[str, ...]:
+        async with FleetClient(where.endpoint()) as client:
+            await client.gateway()
+            return tuple(client.plane.registry.robots)
+
+    try:
+        return asyncio.run(go())
+    except UnreachableError:
+        return ()
+
+
+def _confirmed(text: str, where: Where) -> Plan | None:
+    """Show the plan of an instruction on the terminal; it, when the operator wants it to run."""
+
+    async def go() -> PlanAnswer:
+        async with FleetClient(where.endpoint()) as client:
+            with console.err.status("planning"):
+                return await client.plan(text)
+
+    answer = asyncio.run(go())
+    console.out.print(console.plan_answer(answer))
+    return answer.plan if console.asked("run this plan?") else None
 
 
 async def _cancel(client: FleetClient, task: str) -> None:

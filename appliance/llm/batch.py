@@ -7,7 +7,7 @@ has an answer to each case. Lines that are no case are told with their numbers a
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -19,7 +19,8 @@ from appliance.errors import ConfigError, NotFoundError, PlanError, RecordError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.model import Plan, RobotInfo
+from appliance.llm.stop_words import stop_request
+from appliance.model import Plan, RobotInfo, Site, Verdict
 from appliance.skills.catalogue import Catalogue
 
 Choice = Literal["auto", "local", "upstream", "rules"]
@@ -108,12 +109,9 @@ def config_for(config: LlmConfig, tier: Choice) -> LlmConfig:
         raise ConfigError("there is no local model", remedy="name its folder with --model, or in llm.local_model")
     if tier == "upstream" and not config.upstream_url:
         raise ConfigError("there is no upstream model", remedy="set llm.upstream_url and give the file with --config")
-    asked = replace(config, require_implemented=False, floor_confidence=0.0, cache=0)
-    if tier == "auto":
-        return asked  # with its thresholds: which tier answers rests on them
-    return replace(
-        asked, tiers=(tier,), local_min_confidence=0.0, upstream_min_confidence=0.0, rules_min_confidence=0.0
-    )
+    # Every case gets its best plan, however unsure; `decision` says what a fleet would do with it.
+    asked = replace(config, require_implemented=False, show_confidence=0.0, cache=0)
+    return asked if tier == "auto" else replace(asked, tiers=(tier,))
 
 
 def everyman(name: str, catalogue: Catalogue) -> RobotInfo:
@@ -123,11 +121,15 @@ def everyman(name: str, catalogue: Catalogue) -> RobotInfo:
     return RobotInfo(id=name, kind="zenoh", uses=uses, verbs=verbs, flies=True)
 
 
-def prediction(case: str, plan: Plan | None, why: str = "") -> dict[str, Any]:
-    """Return the line of a case."""
+def prediction(
+    case: str, plan: Plan | None, why: str = "", *, decision: Verdict | None = None, stops: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the line of a case: the plan, what a fleet would do with it, and the checks that spoke."""
     if plan is None:
         empty: dict[str, Any] = {"id": case, "domain": "", "subtasks": [], "tier": "none", "confidence": 0.0}
-        return {**empty, "latency_ms": 0.0, "why": why}
+        found: dict[str, Any] = {"decision": (decision or Verdict.REFUSE).value, "checks": []}
+        stopped = {"robots": list(stops)} if decision is Verdict.STOP else {}
+        return {**empty, "latency_ms": 0.0, "why": why, **found, **stopped}
     subtasks = [
         {"id": each.id, "skill": each.skill, "robot": each.robot, "params": each.params, "after": list(each.after)}
         for each in plan.subtasks
@@ -141,6 +143,8 @@ def prediction(case: str, plan: Plan | None, why: str = "") -> dict[str, Any]:
         "confidence": plan.confidence,
         "latency_ms": first.latency_ms if first is not None else plan.latency_ms,
         **({"model": first.model} if first is not None and first.model else {}),
+        "decision": (decision or Verdict.RUN).value,
+        "checks": msgspec.to_builtins(first.findings if first is not None else ()),
     }
 
 
@@ -152,6 +156,8 @@ async def run(
     catalogue: Catalogue,
     tier: Choice = "auto",
     safety: SafetyConfig | None = None,
+    site: Site | None = None,
+    roster: Mapping[str, RobotInfo] | None = None,
     progress: Progress = lambda _: None,
 ) -> Report:
     """Plan every case that has no prediction yet, one after the other.
@@ -163,6 +169,8 @@ async def run(
         catalogue: the skills there are.
         tier: which of them; `auto` asks in order as a gateway does.
         safety: the policy; by default one that forbids nothing.
+        site: its places, things, fence and limits count; None: names of places are not checked.
+        roster: what robots can do, by name; one that it lacks can do everything.
         progress: told how far it is.
 
     Raises:
@@ -184,7 +192,9 @@ async def run(
         await decomposer.start()
         with _opened(out) as file:
             for number, case in enumerate(left, start=1):
-                line = await _predicted(decomposer, case, catalogue)
+                line = await predicted(
+                    decomposer, case, catalogue, site=site, roster=roster or {}, show_from=config.show_confidence
+                )
                 planless += line["tier"] == "none"
                 file.write(json.dumps(line, ensure_ascii=False).encode(errors="replace") + b"\n")
                 file.flush()
@@ -203,13 +213,30 @@ async def run(
     )
 
 
-async def _predicted(decomposer: Decomposer, case: Case, catalogue: Catalogue) -> dict[str, Any]:
-    robots = None if case.robots is None else tuple(everyman(name, catalogue) for name in case.robots)
+async def predicted(
+    decomposer: Decomposer,
+    case: Case,
+    catalogue: Catalogue,
+    *,
+    site: Site | None = None,
+    roster: Mapping[str, RobotInfo] | None = None,
+    show_from: float = 0.0,
+) -> dict[str, Any]:
+    """Return the line of a case, decided as a fleet would: run, hold, refuse or stop."""
+    known = roster or {}
+    robots = (
+        None if case.robots is None else tuple(known.get(name) or everyman(name, catalogue) for name in case.robots)
+    )
+    if (stop := stop_request(case.instruction, case.robots or ())) is not None:
+        return prediction(case.id, None, "a stop, not a task", decision=Verdict.STOP, stops=stop.robots)
     try:
-        outcome = await decomposer.plan(PlanContext(instruction=case.instruction, robots=robots))
+        outcome = await decomposer.plan(PlanContext(instruction=case.instruction, robots=robots, site=site))
     except PlanError as error:
         return prediction(case.id, None, error.message)
-    return prediction(case.id, outcome.plan)
+    plan = outcome.plan
+    held = plan.provenance is not None and bool(plan.provenance.confirm)
+    decision = Verdict.REFUSE if plan.confidence < show_from else Verdict.HOLD if held else Verdict.RUN
+    return prediction(case.id, plan, decision=decision)
 
 
 def _resumed(out: Path) -> set[str]:

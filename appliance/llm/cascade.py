@@ -19,26 +19,25 @@ import structlog
 
 from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError, SwiftbotError
 from appliance.llm.analysis import Analysis, analyse
+from appliance.llm.checks.schema import MAX_PROBLEMS, validate
+from appliance.llm.completion import completed
 from appliance.llm.experience.memory import Memory
 from appliance.llm.figures import Figures
-from appliance.llm.intake import explained, no_plan, refused
+from appliance.llm.intake import explained, no_plan, refused, stop_refused
 from appliance.llm.peers import ProposeAsk, Proposed
-from appliance.llm.routing.agreement import after_resort
+from appliance.llm.review import Facts, Review, review
 from appliance.llm.routing.budget import Budget
 from appliance.llm.routing.canonical import catalogue_digest, digest, plan_key
 from appliance.llm.routing.gate import Gate
 from appliance.llm.routing.privacy import Privacy
 from appliance.llm.routing.thresholds import Thresholds
-from appliance.llm.checks.policy import unsafe
-from appliance.llm.safety.confirming import reasons_to_confirm
-from appliance.llm.checks.grounding import ungrounded
 from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome, TierAttempt
+from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome
 from appliance.llm.so_far import so_far
+from appliance.llm.stop_words import stop_request
 from appliance.llm.tier import Planner, Proposal
 from appliance.llm.tiers import Slot, configured
-from appliance.llm.checks.schema import MAX_PROBLEMS, validate
-from appliance.model import Plan, PlannerStatus, Provenance, TaskRecord, Tier, plan_hash
+from appliance.model import Finding, Plan, PlannerStatus, Provenance, Severity, TaskRecord, Tier, TierAttempt, plan_hash
 from appliance.skills.catalogue import Catalogue
 
 if TYPE_CHECKING:
@@ -48,8 +47,12 @@ __all__ = ["Decomposer", "Slot"]
 
 log = structlog.get_logger(__name__)
 
-Check = Callable[[Plan, bool], tuple[str, ...]]
-"""What is wrong with a plan; the second argument: whether it is held to the words of the instruction."""
+Judge = Callable[[Plan, float, float], tuple[Plan, Review]]
+"""Completes a plan by what the site knows, and reviews it; given how sure its planner is, and from when plans run."""
+
+
+_GUESS = 0.1
+"""A plan that is less sure is right one time in fifteen (`llm.show_confidence`)."""
 
 
 class Decomposer:
@@ -93,12 +96,12 @@ class Decomposer:
             price_out=config.upstream_price_out,
         )
         given = None if slots is None else tuple(slots)
-        self._slots = configured(config, catalogue, peers, self._pay) if given is None else given
+        self._slots = configured(config, catalogue, peers, self._pay, self._safety) if given is None else given
         self._privacy = Privacy(
             never=config.upstream_never, robots=config.upstream_never_robots, tag=config.upstream_private_tag
         )
-        base = {slot.planner.name.value: slot.min_confidence for slot in self._slots}
-        thresholds = Thresholds(base, confirm_below=self._safety.confirm_below, clock=clock)
+        base = {slot.planner.name.value: config.run_confidence for slot in self._slots}
+        thresholds = Thresholds(base, clock=clock)
         self.memory = Memory(thresholds=thresholds, budget=self._budget, most_plans=config.cache, clock=clock)
         """What became of earlier plans, and what follows for the next."""
         self._gate = Gate(at_once=config.at_once, waiting=config.waiting)
@@ -185,7 +188,7 @@ class Decomposer:
         context = PlanContext(instruction=ask.instruction, robots=ask.robots)
         async with self._gate.turn(), _deadline(slot.deadline_s, "local"):
             said = await slot.planner.propose(context)
-        return Proposed(plan=said.plan, confidence=said.confidence, doubtful=said.doubtful, model=said.model)
+        return Proposed(plan=said.plan, confidence=said.confidence, model=said.model)
 
     async def plan(self, context: PlanContext) -> PlanOutcome:
         """Plan an instruction.
@@ -198,10 +201,14 @@ class Decomposer:
         if problem := refused(context.instruction):
             raise problem
 
-        def check(plan: Plan, grounded: bool) -> tuple[str, ...]:
-            return self._check(plan, context, grounded=grounded)
+        if (stop := stop_request(context.instruction, [each.id for each in context.robots or ()])) is not None:
+            raise stop_refused(stop)
 
-        return await self._turn(context, check)
+        def judge(plan: Plan, confidence: float, run_from: float) -> tuple[Plan, Review]:
+            whole = completed(plan, context, self._catalogue)
+            return whole, self._review(whole, context, confidence=confidence, run_from=run_from)
+
+        return await self._turn(context, judge)
 
     async def replan(
         self,
@@ -228,25 +235,25 @@ class Decomposer:
         """
         context = self._privacy.marked(msgspec.structs.replace(context, so_far=so_far(record)))
 
-        def check(plan: Plan, grounded: bool) -> tuple[str, ...]:
+        def judge(plan: Plan, confidence: float, run_from: float) -> tuple[Plan, Review]:
             # Its form first: what cannot be a plan cannot be fitted to the record either.
             wrong = validate(plan, self._catalogue)
-            if wrong:
-                return wrong
-            try:
-                return (*problems(plan), *self._check(rest(plan), context, grounded=grounded))
-            except PlanError as error:
-                return (error.message, *error.problems)
+            if not wrong:
+                try:
+                    wrong = tuple(problems(plan))
+                    part = rest(plan)
+                except PlanError as error:
+                    wrong = (*wrong, error.message, *error.problems)
+                else:
+                    found = self._review(part, context, confidence=confidence, run_from=run_from)
+                    return plan, Review(findings=(*map(_refusal, wrong), *found.findings))
+            return plan, Review(findings=tuple(map(_refusal, wrong)))
 
-        return await self._turn(context, check)
+        return await self._turn(context, judge)
 
-    def check(self, plan: Plan, context: PlanContext) -> tuple[str, ...]:
-        """Return what is wrong with a plan that somebody hands in: as of any plan, but its words are its author's."""
-        return self._check(plan, context, grounded=False, require_implemented=True)
-
-    def confirm(self, plan: Plan) -> tuple[str, ...]:
-        """Return why an operator should agree to a plan that a robot hands in: its author's confidence says nothing."""
-        return reasons_to_confirm(plan, self._safety, confidence=1.0, confirm_below=0.0)
+    def review(self, plan: Plan, context: PlanContext) -> Review:
+        """Review a plan that a person or a robot wrote: as any, but the words only give notes."""
+        return review(Facts(plan, context, self._catalogue, self._safety, require_implemented=True, edited=True))
 
     def analyse(self, context: PlanContext, plan: Plan) -> Analysis:
         """Return what an instruction asks for, with its plan and by what is known of the skills and robots."""
@@ -264,14 +271,13 @@ class Decomposer:
 
     # --- the way through the tiers ------------------------------------------------------------------------------
 
-    async def _turn(self, context: PlanContext, check: Check) -> PlanOutcome:
+    async def _turn(self, context: PlanContext, judge: Judge) -> PlanOutcome:
         began = time.monotonic()
         async with self._gate.turn():
             key = plan_key(context, catalogue=self._catalogue_digest, policy=self._policy_digest)
-            found = self._cached(key, check) or await self._cascade(context, check)
+            found = self._cached(key, judge) or await self._cascade(context, judge)
         plan = found.plan
         self._figures.planned(plan.tier, found.attempts)
-        thresholds = self.memory.thresholds
         provenance = Provenance(
             tier=plan.tier,
             model=found.model,
@@ -282,39 +288,42 @@ class Decomposer:
             hash=plan_hash(plan),
             key=key,
             cache=found.cache,
-            confirm=reasons_to_confirm(
-                plan, self._safety, confidence=plan.confidence, confirm_below=thresholds.confirm_below
-            ),
+            confirm=found.review.holds,
+            findings=found.review.findings,
         )
         plan = msgspec.structs.replace(plan, provenance=provenance)
         return PlanOutcome(plan=plan, attempts=found.attempts)
 
-    def _cached(self, key: str, check: Check) -> "_Found | None":
+    def _cached(self, key: str, judge: Judge) -> "_Found | None":
         """Return the plan of the cache, if it still holds."""
         began = time.monotonic()
         kept = self.memory.cache.find(key)
         if kept is None:
             return None
-        if problems := check(kept.plan, False):
-            log.info("a plan of the cache does not hold any more", problems=problems)
+        # It has been carried out with success: how sure its planner was then says nothing now.
+        completed_, found = judge(kept.plan, 1.0, 0.0)
+        if found.problems:
+            log.info("a plan of the cache does not hold any more", problems=found.problems)
             self.memory.forget_plan(key)
             return None
         elapsed = round(1000 * (time.monotonic() - began), 3)
         plan = msgspec.structs.replace(
-            kept.plan, tier=Tier.CACHE, confidence=round(kept.confidence, 4), latency_ms=elapsed
+            completed_, tier=Tier.CACHE, confidence=round(kept.confidence, 4), latency_ms=elapsed
         )
         first = kept.plan.provenance
         return _Found(
             plan=plan,
+            review=found,
             attempts=(TierAttempt(tier=Tier.CACHE.value, ok=True, confidence=plan.confidence),),
             model=first.model if first is not None else "",
             gateway=first.gateway if first is not None else "",
             cache=kept.told,
         )
 
-    async def _cascade(self, context: PlanContext, check: Check) -> "_Found":
+    async def _cascade(self, context: PlanContext, judge: Judge) -> "_Found":
         attempts: list[TierAttempt] = []
-        best: tuple[Proposal, int] | None = None
+        best: _Candidate | None = None
+        refusals: list[Finding] = []
         proposed: set[Tier] = set()
         words = len(context.instruction.split())
         for slot in self._slots:
@@ -324,34 +333,33 @@ class Decomposer:
             if skipped := self._skip(slot, context, words):
                 attempts.append(TierAttempt(tier=tier, ok=False, problems=(skipped,)))
                 continue
-            proposal, attempt, answered = await self._ask(slot, context, check)
+            candidate, attempt, answered = await self._ask(slot, context, judge, refusals)
             attempts.append(attempt)
             if answered:
                 proposed.add(slot.planner.name)
-            if attempt.ok and proposal is not None:
-                sure = None if best is None else after_resort(best[0].plan, attempts[best[1]].confidence, proposal)
-                if best is None or sure is None:
-                    return _stamped(proposal, attempts, len(attempts) - 1)
-                attempts[best[1]] = msgspec.structs.replace(attempts[best[1]], confidence=sure)
-                why = f"the plan of {attempts[best[1]].tier} is taken: {sure:.2f} sure with this one beside it"
-                attempts[-1] = msgspec.structs.replace(attempt, ok=False, problems=(why, *attempt.problems))
-                continue
+            if candidate is not None:
+                candidate = msgspec.structs.replace(candidate, index=len(attempts) - 1)
+                if attempt.ok:
+                    return candidate.found(attempts)
+                if attempt.confidence >= self._config.show_confidence and (best is None or candidate.rank < best.rank):
+                    best = candidate
             self._figures.failed(tier)
-            # A proposal that comes back is valid: here it was only not sure enough.
-            usable = proposal is not None and slot.fallback and attempt.confidence >= self._config.floor_confidence
-            if usable and proposal and (best is None or attempt.confidence > attempts[best[1]].confidence):
-                best = (proposal, len(attempts) - 1)
         if best is not None:
-            proposal, index = best
-            attempts[index] = msgspec.structs.replace(attempts[index], ok=True)
-            return _stamped(proposal, attempts, index)
-        raise no_plan(attempts, explained(context.instruction))
+            attempts[best.index] = msgspec.structs.replace(attempts[best.index], ok=True)
+            return best.found(attempts)
+        raise no_plan(attempts, explained(context.instruction), refusals)
 
-    async def _ask(self, slot: Slot, context: PlanContext, check: Check) -> tuple[Proposal | None, TierAttempt, bool]:
-        """Ask one tier, with one repair; a proposal that is returned is valid. Last: whether it proposed anything."""
+    async def _ask(
+        self, slot: Slot, context: PlanContext, judge: Judge, refusals: list[Finding]
+    ) -> "tuple[_Candidate | None, TierAttempt, bool]":
+        """Ask one tier, with one repair; a candidate that is returned is not refused. Last: whether it proposed any.
+
+        The attempt is `ok` when the plan may be taken at once: no other plan for the same words could do better.
+        """
         tier = slot.planner.name.value
         self._figures.asked(tier)
         began = time.monotonic()
+        least = max(self._config.run_confidence, self.memory.thresholds.of(tier))
         if slot.leaves_machine:
             context = self._privacy.trimmed(context)
 
@@ -362,14 +370,18 @@ class Decomposer:
                 tier=tier, ok=ok, confidence=confidence, latency_ms=elapsed, problems=tuple(problems[:MAX_PROBLEMS])
             )
 
+        def judged(proposal: Proposal) -> tuple[float, Plan, Review]:
+            confidence = round(min(1.0, max(0.0, proposal.confidence)), 4)
+            return confidence, *judge(proposal.plan, confidence, least)
+
         try:
             async with _deadline(slot.deadline_s, tier):
                 proposal = await slot.planner.propose(context)
-                problems = check(proposal.plan, slot.grounded)
-                if problems and slot.planner.repairs and self._config.repair:
-                    log.info("plan is repaired", tier=tier, problems=problems)
-                    proposal = await slot.planner.propose(context, previous=proposal.plan, problems=problems)
-                    problems = check(proposal.plan, slot.grounded)
+                confidence, plan, found = judged(proposal)
+                if found.problems and slot.planner.repairs and self._config.repair:
+                    log.info("plan is repaired", tier=tier, problems=found.problems)
+                    proposal = await slot.planner.propose(context, previous=proposal.plan, problems=found.problems)
+                    confidence, plan, found = judged(proposal)
         except PlanError as error:
             return None, attempt(ok=False, confidence=0.0, problems=(error.message, *error.problems)), True
         except SwiftbotError as error:
@@ -378,16 +390,13 @@ class Decomposer:
         except Exception as error:  # supervision boundary: a broken tier must not keep the next from being asked
             log.exception("planner tier is broken", tier=tier)
             return None, attempt(ok=False, confidence=0.0, problems=(f"internal error: {error!r}"[:300],)), False
-        confidence = round(min(1.0, max(0.0, proposal.confidence)), 4)
-        if problems:
-            return None, attempt(ok=False, confidence=confidence, problems=(*problems, *proposal.problems)), True
-        least = max(slot.min_confidence, self.memory.thresholds.of(tier))
-        lacks: tuple[str, ...] = ()
-        if confidence < least:
-            lacks = (f"confidence {confidence:.2f} is below {least:.2f}",)
-        elif proposal.doubtful and not slot.takes_doubtful:
-            lacks = ("it breaks a rule of plans, of which no confidence is enough",)
-        return proposal, attempt(ok=not lacks, confidence=confidence, problems=(*lacks, *proposal.problems)), True
+        if found.problems:
+            refusals += [each for each in found.findings if each.severity is Severity.REFUSE]
+            said = attempt(ok=False, confidence=confidence, problems=(*found.problems, *proposal.problems))
+            return None, said, True
+        candidate = _Candidate(proposal=msgspec.structs.replace(proposal, plan=plan), review=found)
+        said = attempt(ok=not found.doubts, confidence=confidence, problems=(*found.holds, *proposal.problems))
+        return candidate, said, True
 
     def _paid(self) -> None:
         self.memory.spent()
@@ -404,37 +413,64 @@ class Decomposer:
             return f"not asked: {words} words are more than the {slot.max_words} it is good at"
         return ""
 
-    def _check(
-        self, plan: Plan, context: PlanContext, *, grounded: bool, require_implemented: bool | None = None
-    ) -> tuple[str, ...]:
-        require = self._config.require_implemented if require_implemented is None else require_implemented
-        wrong = validate(plan, self._catalogue, robots=context.robots, site=context.site, require_implemented=require)
-        if wrong:
-            return wrong
-        wrong = unsafe(plan, context, self._catalogue, self._safety)
-        return wrong or (ungrounded(plan, context) if grounded and self._safety.grounded else ())
+    def _review(self, plan: Plan, context: PlanContext, *, confidence: float, run_from: float) -> Review:
+        return review(
+            Facts(
+                plan,
+                context,
+                self._catalogue,
+                self._safety,
+                require_implemented=self._config.require_implemented,
+                confidence=confidence,
+                run_from=run_from,
+            )
+        )
+
+
+class _Candidate(msgspec.Struct, frozen=True, kw_only=True):
+    """A plan that is not refused; `index` of its attempt."""
+
+    proposal: Proposal
+    review: Review
+    index: int = 0
+
+    @property
+    def rank(self) -> tuple[bool, int, float]:
+        """Order of preference, the best first: what is no mere guess, what fewer checks hold, what is surer."""
+        others = sum(each.check != "confidence" for each in self.review.findings if each.severity is Severity.HOLD)
+        return self.proposal.confidence < _GUESS, others, -self.proposal.confidence
+
+    def found(self, attempts: Sequence[TierAttempt]) -> "_Found":
+        attempt = attempts[self.index]
+        plan = msgspec.structs.replace(
+            self.proposal.plan,
+            tier=Tier(attempt.tier),
+            confidence=attempt.confidence,
+            latency_ms=attempt.latency_ms,
+            provenance=None,
+        )
+        return _Found(
+            plan=plan,
+            review=self.review,
+            attempts=tuple(attempts),
+            model=self.proposal.model,
+            gateway=self.proposal.gateway,
+        )
+
+
+def _refusal(problem: str) -> Finding:
+    return Finding(check="continuation", severity=Severity.REFUSE, message=problem)
 
 
 class _Found(msgspec.Struct, frozen=True, kw_only=True):
     """A plan, and how it came about."""
 
     plan: Plan
+    review: Review
     attempts: tuple[TierAttempt, ...]
     model: str = ""
     gateway: str = ""
     cache: str = ""
-
-
-def _stamped(proposal: Proposal, attempts: Sequence[TierAttempt], index: int) -> _Found:
-    attempt = attempts[index]
-    plan = msgspec.structs.replace(
-        proposal.plan,
-        tier=Tier(attempt.tier),
-        confidence=attempt.confidence,
-        latency_ms=attempt.latency_ms,
-        provenance=None,
-    )
-    return _Found(plan=plan, attempts=tuple(attempts), model=proposal.model, gateway=proposal.gateway)
 
 
 @contextlib.asynccontextmanager

@@ -82,5 +82,4 @@ class Figures:
             planned=self._planned,
             escalated=self._escalated,
             thresholds=memory.thresholds.all,
-            confirm_below=memory.thresholds.confirm_below,
         )

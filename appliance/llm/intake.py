@@ -10,9 +10,10 @@ import re
 import unicodedata
 from collections.abc import Sequence
 
-from appliance.errors import PlanError
+from appliance.errors import PlanError, RefusedError
 from appliance.llm.checks.schema import MAX_PROBLEMS
-from appliance.model import TierAttempt
+from appliance.llm.stop_words import StopRequest
+from appliance.model import Finding, TierAttempt
 
 MAX_CHARACTERS = 4000
 """Longer text is no instruction; the gateway's own bound (`tasks.max_instruction_chars`) is lower."""
@@ -80,16 +81,33 @@ def explained(instruction: str) -> str:
     return ""
 
 
-def no_plan(attempts: Sequence[TierAttempt], why: str) -> PlanError:
-    """Return the error for an instruction that no tier had a plan for: what each lacked, and how to say it."""
+def stop_refused(stop: StopRequest) -> RefusedError:
+    """Return the error for a text that is a soft stop: never planned, but carried out by a person's command."""
+    who = " ".join(stop.robots)
+    return RefusedError(
+        f"this is a stop, not a task{f' (of {who})' if who else ''}", remedy=f"swiftbot stop {who}".rstrip()
+    )
+
+
+def no_plan(attempts: Sequence[TierAttempt], why: str, refusals: Sequence[Finding] = ()) -> PlanError:
+    """Return the error for an instruction that no tier had a plan for: what each lacked, and how to say it.
+
+    Args:
+        attempts: the tiers that were asked.
+        why: what is the matter with the instruction itself; "" when nothing is known.
+        refusals: what the review found against their plans.
+    """
     if not attempts:
         return PlanError("no planner is configured", remedy='set llm.tiers; "rules" needs nothing else')
     problems = [f"{each.tier}: {problem}" for each in attempts for problem in each.problems]
-    # The last tier asked is the one of last resort: its problems are the most telling.
+    # The last tier asked is the one of last resort: its problems are the most telling, but for a real reason to refuse.
     last = attempts[-1].problems or ("no plan",)
+    reasons = tuple(dict.fromkeys(each.message for each in refusals))[:3]
+    hint = next((each.hint for each in refusals if each.hint), "")
+    said = (why, *(reasons or last[:3])) if why else (reasons or last[:3])
     return PlanError(
-        f"no valid plan for the instruction: {'; '.join((why, *last[:3]) if why else last[:3])}",
-        remedy='mend that, or use plain orders such as "Robot_1: go to goal 2, then photograph the shelf"',
+        f"no valid plan for the instruction: {'; '.join(said)}",
+        remedy=hint or 'rephrase, for example "Robot_1: go to goal 2, then photograph the shelf"; see docs/limits.md',
         problems=tuple(problems[:MAX_PROBLEMS]),
     )
 

@@ -18,21 +18,20 @@ import psutil
 import structlog
 
 from appliance.errors import DeadlineError, PlanError, RefusedError, SwiftbotError, UnreachableError
-from appliance.llm.doubts import doubts
+from appliance.llm.checks.schema import validate
 from appliance.llm.embedded import folder_of
 from appliance.llm.language.codec import Answer, read
 from appliance.llm.language.guide import shapes
 from appliance.llm.language.words import words_of
 from appliance.llm.process import ModelProcess
 from appliance.llm.prompt import messages
-from appliance.llm.checks.contradiction import contradictions
+from appliance.llm.review import INTRINSIC, Facts, review
+from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.schema import plan_grammar, read_plan, robot_names
-from appliance.llm.checks.consistency import Meaning, problems
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.speaking import Question, Said
 from appliance.llm.tier import Proposal
-from appliance.llm.checks.schema import validate
-from appliance.model import Plan, RobotInfo, SlotStatus, Tier
+from appliance.model import Plan, RobotInfo, Severity, SlotStatus, Tier
 from appliance.skills.catalogue import Catalogue
 
 log = structlog.get_logger(__name__)
@@ -44,14 +43,13 @@ _NO_PLAN = {
     "unclear": "it does not say what to do, or with what",
     "language": "only English is understood",
 }
-_UNSOUND = 0.48
-"""How sure it can be of a plan that breaks a rule of plans: another tier is asked whatever the threshold is, and with
-`safety.confirm_below` as it is shipped an operator. Of held-out instructions no such plan was right; yet a program
-reads the rules strictly."""
 _DOUBTFUL = 1
-"""How much a plan is broken that is merely doubtful (`doubts`)."""
+"""The rank of a plan that leaves out a robot, a figure or an order which the words have."""
 _FAR = 0.05
 """Times the confidence of such a plan, which another one must have at least that is to be taken instead."""
+_ODD = 0.5
+"""The same for a plan that only leaves a word over."""
+_TELLING = frozenset(("idle_robot", "quantity", "sequence", "assignment", "negation", "repeated"))
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (
@@ -66,8 +64,9 @@ class LocalTier:
 
     name = Tier.LOCAL
 
-    def __init__(self, config: LlmConfig, catalogue: Catalogue) -> None:
+    def __init__(self, config: LlmConfig, catalogue: Catalogue, safety: SafetyConfig | None = None) -> None:
         self._config = config
+        self._safety = safety or SafetyConfig()
         self._catalogue = catalogue
         self._process = ModelProcess(folder_of(config.local_model), config)
         self._turn = asyncio.Lock()
@@ -280,22 +279,16 @@ class LocalTier:
         )
         began = time.monotonic()
         proposals = self._read(await self._asked(process, question), context, process)
-        best, broken = self._best(proposals, context)
+        best, held = self._best(proposals, context)
         # What breaks a rule of plans was not meant; the next likely answer that breaks none was. Where all do, others
         # are looked for once, in the time that is left.
         left_s = question.deadline_s - (time.monotonic() - began)
-        if broken and left_s > 0:
+        if held and left_s > 0:
             thorough = msgspec.structs.replace(question, thorough=True, deadline_s=left_s)
             with contextlib.suppress(PlanError, DeadlineError, UnreachableError):
-                other, less = self._best(self._read(await self._asked(process, thorough), context, process), context)
-                if less < broken:
-                    best, broken = other, less
-        if not broken:
-            return best
-        # With its problems, for whoever repairs or refuses it, and at most for an operator to look at.
-        why = doubts(_meaning(best.plan, context)) if broken == _DOUBTFUL else ()
-        sure = min(best.confidence, _UNSOUND)
-        return msgspec.structs.replace(best, confidence=sure, doubtful=True, problems=(*best.problems, *why))
+                more = self._read(await self._asked(process, thorough), context, process)
+                best, _ = self._best([best, *more], context)
+        return best
 
     async def _asked(self, process: ModelProcess, question: Question) -> Said:
         said = _said(await process.exchange({"question": msgspec.to_builtins(question)}))
@@ -315,31 +308,38 @@ class LocalTier:
                 found.append(_proposed(read(other.symbols, words, self._catalogue), other.confidence, process))
         return found
 
-    def _best(self, proposals: Sequence[Proposal], context: PlanContext) -> tuple[Proposal, int]:
-        """Return the first that breaks no rule, else the first of those that break least, and how much it breaks.
+    def _best(self, proposals: Sequence[Proposal], context: PlanContext) -> tuple[Proposal, bool]:
+        """Return the likeliest by its own confidence and by the review, and whether a check spoke against it.
 
-        One that is merely doubtful is not given up for one that is far less likely.
+        One that a check holds is not given up for one that is far less likely.
         """
-        broken = [self._broken(each.plan, context) for each in proposals]
-        best = broken.index(min(broken))
-        if _DOUBTFUL in broken and min(broken) < _DOUBTFUL:
-            first = broken.index(_DOUBTFUL)
-            if first < best and proposals[best].confidence < _FAR * proposals[first].confidence:
-                best = first
-        return proposals[best], broken[best]
+        ranks = [self._rank(each.plan, context) for each in proposals]
+        best = ranks.index(min(ranks))
+        for number, (rank, _) in enumerate(ranks[:best]):
+            # The likelier one stands before: it is given up for one that is not far less likely.
+            least = _FAR if rank == _DOUBTFUL else _ODD if rank == 0 else 0.0
+            if least and proposals[best].confidence < least * proposals[number].confidence:
+                best = number
+                break
+        return proposals[best], ranks[best][0] > 0
 
-    def _broken(self, plan: Plan, context: PlanContext) -> int:
-        """Return how little a plan can be what was meant.
+    def _rank(self, plan: Plan, context: PlanContext) -> tuple[int, int]:
+        """Return how little a plan can be what was meant, and whether a check holds it that is less telling.
 
-        0: it keeps all rules; 1: it is doubtful; 2: the validator refuses it; 3: it cannot be
-        meant. The safety policy has no say: what is forbidden is refused, and nothing else done in its place.
+        0: no check speaks against its parts; 1: it leaves out what the words have; 2: it is refused; 3: it is empty
+        or breaks a rule of plans. The operator's policy has no say: what is forbidden is refused, and nothing else is
+        done in its place.
         """
-        meaning = _meaning(plan, context)
-        if not plan.subtasks or problems(meaning, self._catalogue) or any(contradictions(plan)):
-            return 3
-        if validate(plan, self._catalogue, robots=context.robots, site=context.site):
-            return 2
-        return _DOUBTFUL if doubts(meaning) else 0
+        if not plan.subtasks:
+            return 3, 0
+        found = review(Facts(plan, context, self._catalogue, self._safety)).findings
+        telling = [each for each in found if each.check not in ("policy", *INTRINSIC)]
+        if any(each.check in ("consistency", "contradiction") for each in telling):
+            return 3, 0
+        if any(each.severity is Severity.REFUSE for each in telling):
+            return 2, 0
+        held = {each.check for each in telling if each.severity is Severity.HOLD}
+        return (_DOUBTFUL, 0) if held & _TELLING else (0, int(bool(held)))
 
     def _note(self, tokens: int, ms: float, reused: int) -> None:
         self._answered += 1
@@ -349,11 +349,6 @@ class LocalTier:
     def _retry_after_s(self) -> float:
         taken = [ms for _, ms in self._answers] or [1000.0]
         return min(60.0, max(0.1, round(self._inside * sum(taken) / len(taken) / 1000, 1)))
-
-
-def _meaning(plan: Plan, context: PlanContext) -> Meaning:
-    robots = tuple(robot.id for robot in context.robots or ())
-    return Meaning(instruction=context.instruction, robots=robots, domain=plan.domain, subtasks=plan.subtasks)
 
 
 def _proposed(answer: Answer, confidence: float, process: ModelProcess) -> Proposal:

@@ -29,12 +29,10 @@ class ProposeAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Proposed(Struct, frozen=True, kw_only=True):
-    """A plan that nobody has checked yet, and how sure the model is of it."""
+    """A plan that is not reviewed yet, and how sure the model is of it."""
 
     plan: Plan
     confidence: float
-    doubtful: bool = False
-    """As in `Proposal`; gateways of an earlier version do not say it."""
     model: str = ""
 
 
@@ -121,7 +119,6 @@ class PeerTier:
                 return Proposal(
                     plan=answer.plan,
                     confidence=answer.confidence,
-                    doubtful=answer.doubtful,
                     model=answer.model,
                     gateway=name,
                 )

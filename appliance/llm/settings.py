@@ -40,9 +40,6 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A small model on two cores takes a second or two for a long plan; beyond this something is wrong."""
     local_start_s: float = 120.0
     """Loading a model and its fixed prompt; large int4 models take tens of seconds on slow disks."""
-    local_min_confidence: float = 0.6
-    """Below it the next tier is asked, and whatever it is when a plan breaks a rule of plans (two ways at once, say);
-    the slot's margins are not calibrated for every model, so not too strict."""
     local_max_words: int = 150
     """Longer instructions go straight to the next tier: small models lose track in long ones."""
     local_max_tokens: int = 8192
@@ -68,8 +65,6 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One plan, retries and repair apart; hosted models answer in 1-5 s (paper: 1.28 s)."""
     upstream_retries: int = 1
     """Further tries after a connection failure or a 429/5xx answer."""
-    upstream_min_confidence: float = 0.5
-    """A server that gives no log-probabilities counts as 0.9 sure of a valid plan."""
     upstream_max_tokens: int = 4096
     """Longest answer asked for."""
     upstream_budget: float = 0.0
@@ -94,14 +89,14 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     rules_deadline_s: float = 5.0
     """The parser needs milliseconds; the bound is for hostile text."""
-    rules_min_confidence: float = 0.97
-    """Share of the instruction the parser must have understood: half an instruction carried out is a wrong one. Of the
-    held-out instructions with 0.8 to 0.97 one plan in nine was right."""
 
-    floor_confidence: float = 0.1
-    """A valid plan that no tier was sure enough of is still taken, when nothing better came, down to this; below
-    `safety.confirm_below` it waits for an operator, to whom a draft is more use than nothing. Of the embedded planner's
-    plans with 0.1 to 0.3 a quarter is right, of those below one in fifteen."""
+    run_confidence: float = 0.6
+    """A plan runs unasked only if its planner is at least this sure, on the one scale of all tiers (the probability
+    that the plan is right), and no check holds it. Below it the next tier is asked. Experience can raise it for a tier."""
+    show_confidence: float = 0.1
+    """A valid plan that is less sure than `run_confidence` is shown to an operator down to this, when nothing better
+    came; below it the instruction is refused. Of the embedded planner's plans with 0.1 to 0.3 a quarter is right, of
+    those below one in fifteen."""
     repair: bool = True
     """Ask a model once more, with the validator's problems, when its plan is not valid."""
     require_implemented: bool = True
@@ -132,7 +127,7 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ):
             if not 0 < getattr(self, key) <= 3600:
                 raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give seconds between 0 and 3600")
-        for key in ("local_min_confidence", "upstream_min_confidence", "rules_min_confidence", "floor_confidence"):
+        for key in ("run_confidence", "show_confidence"):
             if not 0 <= getattr(self, key) <= 1:
                 raise ConfigError(f"llm.{key}: {getattr(self, key)}", remedy="give a number from 0 to 1")
         for key, low, high in (

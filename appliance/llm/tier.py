@@ -15,16 +15,14 @@ from appliance.model import Plan, Tier
 
 
 class Proposal(Struct, frozen=True, kw_only=True):
-    """A plan as a tier proposes it; `confidence` from 0 to 1. `problems` are its own reservations, for people."""
+    """A plan as a tier proposes it. `problems` are its own reservations, for people.
+
+    `confidence` is the probability, 0 to 1, that the plan is right: one scale for all tiers.
+    """
 
     plan: Plan
     confidence: float
     problems: tuple[str, ...] = ()
-    likely: float | None = None
-    """How likely it is right, 0 to 1, where `confidence` says something else: the rules' is the share of the words
-    that they understood. None: as likely as its confidence says."""
-    doubtful: bool = False
-    """It breaks a rule of plans: no threshold is so low that it is sure enough by itself."""
     model: str = ""
     """The model that wrote it; empty for rules."""
     gateway: str = ""

@@ -6,6 +6,7 @@ from msgspec import Struct
 
 from appliance.llm.routing.budget import Budget
 from appliance.llm.rules.tier import RulesTier
+from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig
 from appliance.llm.tier import Planner
 from appliance.model import Tier
@@ -17,15 +18,8 @@ class Slot(Struct, frozen=True, kw_only=True):
 
     planner: Planner
     deadline_s: float
-    min_confidence: float
     max_words: int = 100_000
     leaves_machine: bool = False
-    fallback: bool = True
-    """Whether its valid plan may be taken, below its own threshold, when nothing better came."""
-    grounded: bool = True
-    """Whether its plans are held to the words of the instruction (`safety.grounding`): models invent, rules do not."""
-    takes_doubtful: bool = False
-    """Whether a plan that breaks a rule of plans may be taken before other tiers are asked: to measure this one."""
     instead_of: Tier | None = None
     """Asked only when that tier made no proposal at all: its second opinion would be the same."""
 
@@ -35,6 +29,7 @@ def configured(
     catalogue: Catalogue,
     peers: Planner | None,
     pay: Callable[[], tuple[Budget, Callable[[], None]]],
+    safety: SafetyConfig,
 ) -> tuple[Slot, ...]:
     """Return the tiers of a configuration, in order of asking.
 
@@ -43,17 +38,17 @@ def configured(
         catalogue: the skills there are.
         peers: the tier that asks other gateways; None where there are none.
         pay: what upstream may cost, and whom to tell that it did.
+        safety: the policy that the local tier chooses its answers by.
     """
     slots: list[Slot] = []
     for name in config.tiers:
         if name == Tier.LOCAL and config.local_model:
-            slots.append(local(config, catalogue))
+            slots.append(local(config, catalogue, safety))
         elif name == Tier.PEER and peers is not None:
             slots.append(
                 Slot(
                     planner=peers,
                     deadline_s=config.peer_deadline_s * config.peer_tries + 1.0,
-                    min_confidence=config.local_min_confidence,
                     max_words=config.local_max_words,
                     leaves_machine=True,
                     instead_of=Tier.LOCAL,
@@ -66,7 +61,6 @@ def configured(
                 Slot(
                     planner=UpstreamTier(config, catalogue, *pay()),
                     deadline_s=config.upstream_deadline_s,
-                    min_confidence=config.upstream_min_confidence,
                     leaves_machine=True,
                 )
             )
@@ -75,22 +69,17 @@ def configured(
                 Slot(
                     planner=RulesTier(catalogue),
                     deadline_s=config.rules_deadline_s,
-                    min_confidence=config.rules_min_confidence,
-                    # Below its threshold words were not understood: carrying out the rest would be inventing.
-                    fallback=False,
-                    grounded=False,
                 )
             )
     return tuple(slots)
 
 
-def local(config: LlmConfig, catalogue: Catalogue) -> Slot:
+def local(config: LlmConfig, catalogue: Catalogue, safety: SafetyConfig | None = None) -> Slot:
     """Return the local tier for `config.local_model`."""
     from appliance.llm.local import LocalTier  # noqa: PLC0415 - a gateway without model must not pay for it
 
     return Slot(
-        planner=LocalTier(config, catalogue),
+        planner=LocalTier(config, catalogue, safety),
         deadline_s=config.local_deadline_s,
-        min_confidence=config.local_min_confidence,
         max_words=config.local_max_words,
     )

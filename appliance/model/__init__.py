@@ -36,11 +36,14 @@ from appliance.model.planner import (
     UpstreamStatus,
 )
 from appliance.model.plans import (
+    Finding,
     Plan,
     Provenance,
+    Severity,
     Subtask,
     Tier,
     TierAttempt,
+    Verdict,
     plan_hash,
 )
 from appliance.model.requests import (
@@ -122,6 +125,7 @@ __all__ = [
     "Enquiry",
     "ErrorReply",
     "Failure",
+    "Finding",
     "GatewayStatus",
     "Group",
     "Lease",
@@ -150,6 +154,7 @@ __all__ = [
     "RunEvent",
     "RunEventKind",
     "RunRequest",
+    "Severity",
     "Signed",
     "Site",
     "SiteObject",
@@ -166,6 +171,7 @@ __all__ = [
     "TierAttempt",
     "TierFigures",
     "UpstreamStatus",
+    "Verdict",
     "VersionVector",
     "VolumeInfo",
     "Way",

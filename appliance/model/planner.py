@@ -83,6 +83,4 @@ class PlannerStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     escalated: int = 0
     """Of the planned ones: those whose plan did not come from the first tier that was asked."""
     thresholds: dict[str, float] = field(default_factory=dict[str, float])
-    """Tier -> confidence from which its plan is taken, as experience has moved it."""
-    confirm_below: float = 0.0
-    """Confidence below which a plan waits for an operator, as experience has moved it."""
+    """Tier -> confidence from which its plans run unasked, as experience has moved it."""

@@ -43,6 +43,41 @@ class TierAttempt(Struct, frozen=True, kw_only=True, omit_defaults=True):
     problems: tuple[str, ...] = ()
 
 
+class Severity(OpenEnum):
+    """What a finding means for a plan."""
+
+    NOTE = "note"
+    """It is shown."""
+    HOLD = "hold"
+    """The plan waits until an operator approves it."""
+    REFUSE = "refuse"
+    """The plan cannot run."""
+
+
+class Verdict(OpenEnum):
+    """What becomes of an instruction."""
+
+    RUN = "run"
+    HOLD = "hold"
+    """Its plan waits until an operator approves it."""
+    REFUSE = "refuse"
+    STOP = "stop"
+    """It is a soft stop, and no plan is made."""
+
+
+class Finding(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What one check says of a plan."""
+
+    check: str
+    """Name of the check, such as `negation`."""
+    severity: Severity
+    message: str
+    words: tuple[str, ...] = ()
+    """The words of the instruction that it is about."""
+    hint: str = ""
+    """What to do, where there is something."""
+
+
 class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Where a plan came from; it stays with the plan in the task's record."""
 
@@ -64,6 +99,8 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How the plan cache was hit, in words; empty when it was not."""
     confirm: tuple[str, ...] = ()
     """Why an operator should agree before it runs; empty: nothing is against it."""
+    findings: tuple[Finding, ...] = ()
+    """What the review of the plan found, by the name of the check."""
 
 
 class Plan(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -46,6 +46,7 @@ _REPOSITORY = "localhost/swiftbot"
 _Kind = TypeVar("_Kind")
 
 Word = Annotated[str, Meta(min_length=1, max_length=60)]
+Phrase = Annotated[str, Meta(min_length=1, max_length=60)]
 
 
 class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -119,8 +120,27 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Why a person should look at a plan before this is done; empty: it is harmless. See `tasks.approval`."""
     checkpoints: bool = False
     """Whether its handler saves a checkpoint when `ctx.checkpoint_due()` says so: worth waiting for before a move."""
-    moves: Literal["", "anytime", "between commands", "never"] = ""
-    """When a run may be moved to another gateway. Empty: `anytime`, or `never` if it sends robot commands."""
+    migratable: Literal["", "anytime", "between commands", "never"] = ""
+    """When a run may migrate to another gateway. Empty: `anytime`, or `never` if it sends robot commands."""
+    opposite_of: tuple[Word, ...] = ()
+    """Skills that undo it: an order for one is never carried out by the other."""
+    moves_robot: bool = False
+    """Whether a run takes the robot's body elsewhere, up and down too."""
+    joint: bool = False
+    """Whether several robots do it together, listed in its parameter `robots`."""
+    flying: bool = False
+    """Whether only a robot that flies can do it."""
+    repeats: bool = False
+    """Whether a plan may well have it twice with the same parameters though the words do not say "twice"."""
+    reports: bool = False
+    """Whether it only tells somebody something: nothing moves, so a condition before it needs no wait."""
+    feeds_on: tuple[Word, ...] = ()
+    """Skills whose output it works on, wherever a plan has one."""
+    at_object: Word | Literal[""] = ""
+    """The parameter that names the thing its robot has to stand at; empty: none."""
+    phrases: tuple[Phrase, ...] = ()
+    """Verbs and verb phrases by which people ask for it, lower case, in the infinitive: the review of a plan holds the
+    words of an instruction against them. A skill without any is never asked for by words alone."""
 
     implemented: bool = False
     """Whether `handler.py` is there. Set by the loader, never in the file."""
@@ -130,7 +150,7 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     @property
     def mobility(self) -> Literal["anytime", "between commands", "never"]:
         """When a run of it may be moved to another gateway."""
-        return self.moves or ("never" if self.verbs else "anytime")
+        return self.migratable or ("never" if self.verbs else "anytime")
 
 
 class ImageSpec(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -219,6 +239,7 @@ def _load(extra: tuple[Path, ...]) -> Catalogue:
             skills[manifest.id] = manifest
     for manifest in skills.values():
         _check_alternatives(manifest, skills)
+        _check_facts(manifest, skills)
     ordered = sorted(skills.values(), key=lambda each: (DOMAINS.index(each.domain), each.id))
     return Catalogue(DOMAINS, {each.id: each for each in ordered}, images)
 
@@ -279,6 +300,25 @@ def _check_alternatives(manifest: SkillManifest, skills: dict[str, SkillManifest
         for name, param in other.params.items():
             if param.required and name not in each.params:
                 raise _wrong(file, "alternatives", f"{other.id} needs {name}: map it in `params`")
+
+
+def _check_facts(manifest: SkillManifest, skills: dict[str, SkillManifest]) -> None:
+    """Check what a manifest says of other skills, and of its own parameters."""
+    file = manifest.folder / "skill.toml"
+    for key, others in (("opposite_of", manifest.opposite_of), ("feeds_on", manifest.feeds_on)):
+        for other in others:
+            if other not in skills or other == manifest.id:
+                raise _wrong(file, key, f"{other!r} is no other skill")
+    for other in manifest.opposite_of:
+        if manifest.id not in skills[other].opposite_of:
+            raise _wrong(file, "opposite_of", f"{other!r} does not name {manifest.id!r} in its own")
+    if manifest.at_object and manifest.at_object not in manifest.params:
+        raise _wrong(file, "at_object", f"{manifest.at_object!r} is none of its parameters")
+    if manifest.joint and "robots" not in manifest.params:
+        raise _wrong(file, "joint", "needed with it: a parameter robots")
+    for phrase in manifest.phrases:
+        if phrase != " ".join(phrase.lower().split()):
+            raise _wrong(file, "phrases", f"{phrase!r}: lower case, single spaces")
 
 
 def _images(root: Path) -> Iterator[ImageSpec]:

@@ -85,8 +85,7 @@ class ExperienceList(Struct, frozen=True, kw_only=True):
     gateway: str
     rows: tuple[Row, ...]
     thresholds: dict[str, float] = {}
-    """Tier -> confidence from which its plan is taken."""
-    confirm_below: float = 0.0
+    """Tier -> confidence from which its plans run unasked."""
 
 
 class RunAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -20,6 +20,8 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.llm.cascade import Decomposer
+from appliance.llm.intake import stop_refused
+from appliance.llm.stop_words import stop_request
 from appliance.model import (
     Group,
     Plan,
@@ -198,6 +200,8 @@ class TaskManager:
             UnreachableError: no owner could be reached within the time allowed.
         """
         request = checked(request, self.config)
+        if request.plan is None and (stop := stop_request(request.instruction, tuple(self.plane.registry.robots))):
+            raise stop_refused(stop)
         until = time.monotonic() + 5.0
         while True:
             owner = ""

@@ -4,8 +4,8 @@ from collections.abc import Awaitable, Callable
 
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.settings import PlanContext
 from appliance.llm.checks.schema import validate
+from appliance.llm.settings import PlanContext
 from appliance.model import Plan, Site, TaskRecord, TaskRequest, TaskState
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue
@@ -43,7 +43,7 @@ class Plans:
         """Return the plan handed in with the task if it is valid, else a new one."""
         context = self._context(record.instruction, submitter=record.submitter)
         if record.plan is not None:
-            if problems := self._decomposer.check(record.plan, context):
+            if problems := self._decomposer.review(record.plan, context).problems:
                 raise PlanError("the plan handed in is not valid", problems=problems)
             return record.plan
         return (await self._decomposer.plan(context)).plan
@@ -61,7 +61,8 @@ class Plans:
         if not record.handed_in:
             doubts = plan.provenance.confirm if plan.provenance is not None else ()
         elif record.submitter in self._plane.registry.robots:
-            doubts = self._decomposer.confirm(plan)
+            context = self._context(record.instruction, submitter=record.submitter)
+            doubts = self._decomposer.review(plan, context).holds
         return "; ".join((*doubts, wanted) if wanted else doubts)
 
     def problems(self, record: TaskRecord | None, plan: Plan) -> tuple[str, ...]:
@@ -75,7 +76,7 @@ class Plans:
             except PlanError as error:
                 return (error.message, *error.problems)
         submitter, instruction = (record.submitter, record.instruction) if record is not None else ("", "")
-        return self._decomposer.check(plan, self._context(instruction, submitter=submitter))
+        return self._decomposer.review(plan, self._context(instruction, submitter=submitter)).problems
 
     async def check(self, ask: PlanCheckAsk) -> PlanChecked:
         """Answer `plan_check`."""
@@ -113,5 +114,4 @@ class Plans:
             gateway=self._plane.gateway,
             rows=tuple(memory.experience.rows()[: max(0, ask.limit)]),
             thresholds=memory.thresholds.all,
-            confirm_below=memory.thresholds.confirm_below,
         )

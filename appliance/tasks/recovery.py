@@ -111,12 +111,12 @@ class Recovery:
             robot: who takes over from the robot of `target`; "" when nobody does.
         """
         context = self._context(record)
-        wrong = self._decomposer.check(remainder(record, target, plan, robot), context)
+        wrong = self._decomposer.review(remainder(record, target, plan, robot), context).problems
         if not wrong:
             return ()
         # A robot that has left meanwhile, say, is no reason against what is done about another's failure.
         before = remainder(record, target, record.plan, "") if record.plan is not None else plan
-        known = frozenset(self._decomposer.check(before, context))
+        known = frozenset(self._decomposer.review(before, context).problems)
         return tuple(each for each in wrong if each not in known)
 
     def _context(self, record: TaskRecord) -> PlanContext:

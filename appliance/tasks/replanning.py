@@ -107,9 +107,8 @@ class Replanning:
             return
         # Whoever confirmed a plan before it ran is asked again, as is the rule for first plans: this is another one.
         doubts = news.plan.provenance.confirm if news.plan.provenance is not None else ()
-        unsure = news.plan.confidence < self._around.config.replan.confirm_below
         rule = self._around.approval(keeper.record, news.plan)
-        waits = bool(doubts) or unsure or confirmed(keeper.record) or bool(rule)
+        waits = bool(doubts) or confirmed(keeper.record) or bool(rule)
         said = f"planned anew by {news.plan.tier} ({news.plan.confidence:.2f} sure)"
         if rule:
             said = f"{said}, to be approved ({rule})"

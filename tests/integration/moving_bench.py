@@ -88,7 +88,7 @@ memory_mb = 64
 timeout_s = 300
 retries = 0
 verbs = ["goto", "state"]
-moves = "between commands"
+migratable = "between commands"
 
 [params.laps]
 type = "integer"

@@ -24,6 +24,7 @@ from appliance.errors import NotFoundError, PayloadError, PlanError
 from appliance.llm.batch import everyman, prediction
 from appliance.llm.cascade import Decomposer, Slot
 from appliance.llm.routing.budget import Budget
+from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.scoring import Score, mean_figures
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tiers import configured
@@ -85,25 +86,16 @@ async def run(
         wanted,
         require_implemented=False,
         cache=0,
-        local_min_confidence=0.0,
-        upstream_min_confidence=0.0,
-        rules_min_confidence=0.0,
+        run_confidence=0.0,
+        show_confidence=0.0,
     )
-    least = {
-        "local": wanted.local_min_confidence,
-        "upstream": wanted.upstream_min_confidence,
-        "rules": wanted.rules_min_confidence,
-    }
     paid = Budget(
         cost=wanted.upstream_budget,
         requests=wanted.upstream_requests,
         price_in=wanted.upstream_price_in,
         price_out=wanted.upstream_price_out,
     )
-    slots = [
-        msgspec.structs.replace(each, takes_doubtful=True)
-        for each in configured(asking, catalogue, None, lambda: (paid, lambda: None))
-    ]
+    slots = configured(asking, catalogue, None, lambda: (paid, lambda: None), SafetyConfig())
     decomposer = Decomposer(asking, catalogue, slots=slots)
     await decomposer.start()
     rows: list[Score] = []
@@ -131,7 +123,7 @@ async def run(
                 continue
             latency.append(plan.latency_ms)
             tiers[plan.tier.value] = tiers.get(plan.tier.value, 0) + 1
-            if plan.confidence >= least[plan.tier.value]:
+            if plan.confidence >= wanted.run_confidence:
                 taken.append(row)
             if not row.exact:
                 progress(f"{case.id}: confidence {plan.confidence:.2f}, decomposition {row.decomposition:.2f}")
@@ -148,18 +140,17 @@ async def run(
         "routed_on": f"the confidence of {first}" + (": there is no local model" if first != "local" else ""),
         "upstream": f"gold plans after {UPSTREAM_MS:g} ms",
         "curve": curve(answered),
-        "cascade": await _cascade(found, asking, least, catalogue, score) if upstream else None,
+        "cascade": await _cascade(found, wanted, catalogue, score) if upstream else None,
     }
 
 
-async def _cascade(
-    cases: Sequence[Case], config: LlmConfig, least: dict[str, float], catalogue: Catalogue, score: ModuleType
-) -> dict[str, Any]:
+async def _cascade(cases: Sequence[Case], config: LlmConfig, catalogue: Catalogue, score: ModuleType) -> dict[str, Any]:
     """Put all cases to the real cascade, `AT_ONCE` at a time, with an upstream that is always right after a while."""
-    base = [slot for slot in configured(config, catalogue, None, _unpaid) if slot.planner.name is not Tier.UPSTREAM]
-    slots = [msgspec.structs.replace(each, min_confidence=least[each.planner.name.value]) for each in base]
+    config = msgspec.structs.replace(config, require_implemented=False, cache=0)
+    made = configured(config, catalogue, None, _unpaid, SafetyConfig())
+    slots = [slot for slot in made if slot.planner.name is not Tier.UPSTREAM]
     gold = GoldTier({case.instruction: gold_plan(case.gold) for case in cases})
-    slots.append(Slot(planner=gold, deadline_s=60.0, min_confidence=0.0, leaves_machine=True, grounded=False))
+    slots.append(Slot(planner=gold, deadline_s=60.0, leaves_machine=True))
     decomposer = Decomposer(msgspec.structs.replace(config, at_once=AT_ONCE), catalogue, slots=slots)
     await decomposer.start()
     turns = asyncio.Semaphore(AT_ONCE)
@@ -180,7 +171,7 @@ async def _cascade(
     return {
         "figures": mean_figures([row for row, _, _ in found]),
         "escalated": round(100 * escalated / max(1, len(found)), 1),
-        "thresholds": {slot.planner.name.value: slot.min_confidence for slot in slots[:-1]},
+        "run_confidence": config.run_confidence,
         "latency_ms": {"p50": _at(times, 0.5), "p99": _at(times, 0.99)},
         "planless": sum(plan is None for _, plan, _ in found),
     }

@@ -6,8 +6,8 @@ from msgspec import Struct
 
 from appliance.llm.analysis.allocation import Allocation, allocations
 from appliance.llm.analysis.constraints import Constraint, constraints
-from appliance.llm.language.values import unit_of
 from appliance.llm.checks.schema import able
+from appliance.llm.language.values import unit_of
 from appliance.model import Plan, RobotInfo, Subtask
 from appliance.skills.catalogue import Catalogue
 

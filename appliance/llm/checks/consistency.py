@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 
-from appliance.llm.language.plurals import singular
 from appliance.llm.checks.schema import JOINT
+from appliance.llm.language.plurals import singular
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue, SkillManifest
 

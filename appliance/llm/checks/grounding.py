@@ -9,11 +9,11 @@ enough, in any inflection, since names are put in a plain form.
 import re
 from collections.abc import Iterable
 
-from appliance.llm.language.values import figures
-from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.consistency import NUMBERS
-from appliance.llm.settings import PlanContext
+from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.schema import is_unnamed, shown
+from appliance.llm.language.values import figures
+from appliance.llm.settings import PlanContext
 from appliance.model import Plan
 
 _TOKEN = re.compile(r"[a-z]+|\d+")

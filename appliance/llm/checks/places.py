@@ -1,29 +1,50 @@
-"""All names of a place that a text names: whoever forbids one of them means the place, however it is called. Pure."""
+"""Places: what a text names on a site, and whether a robot may go there. Pure.
+
+One parser reads coordinates for plans, missions and the policy: two numbers, or three with a height, in metres of the
+site. The skills in their containers read the same forms (`skills/_lib/places.py`), held together by a test.
+"""
 
 import math
 import re
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeGuard
 
-from appliance.llm.checks.schema import locate
-from appliance.model import Place, Site
+from appliance.model import Box, Place, Site, Subtask
 from appliance.skills.sites import plain_name
 
 SAME_SPOT_M = 1.0
 """A coordinate as near as this to a place is that place: a robot that stands there is in its way."""
 MOST_PARTS = 64
-_NUMBER = r"[-+]?\d{1,6}(?:\.\d+)?"
-_COORDINATE = re.compile(
-    rf"\(?\s*x?\s*=?\s*({_NUMBER})\s*[,; ]\s*y?\s*=?\s*({_NUMBER})(?:\s*[,; ]\s*z?\s*=?\s*({_NUMBER}))?\s*\)?"
+GEOGRAPHIC_DEG = 0.5
+"""A pair of numbers as near as this to the site's latitude and longitude is meant as such, where it has decimals."""
+_NUMBER = r"[-+−]?\d{1,6}(?:\.\d+)?"
+COORDINATE = re.compile(
+    rf"\(?\s*x?\s*=?\s*({_NUMBER})\s*m?\s*[,; ]\s*y?\s*=?\s*({_NUMBER})\s*m?"
+    rf"(?:\s*[,; ]\s*z?\s*=?\s*({_NUMBER})\s*m?)?\s*\)?"
 )
 _IN_BRACKETS = re.compile(r"\([^()]*\)")
 _SPLIT = re.compile(r"[,;]|->|→|\b(?:then|and|via|to|from)\b")
 """What stands between the places of a route, as the skills read it."""
 
 
+def coordinate(text: str) -> Place | None:
+    """Return the point that a text such as "12.5, 7", "(3, 4, 8)" or "x=3 y=4" names, metres; None for any other."""
+    match = COORDINATE.fullmatch(text.strip())
+    if match is None:
+        return None
+    x, y, z = (float((each or "0").replace("−", "-")) for each in match.groups())
+    return Place(x=x, y=y, z=z)
+
+
+def locate(name: str, site: Site) -> Place | None:
+    """Return the place a text names: a place of the site, or a coordinate."""
+    return site.find(name) or coordinate(name)
+
+
 def spot_of(name: str, site: Site | None) -> Place | None:
     """Return the place or coordinate that a text names, read as leniently as the skills do."""
-    if match := _COORDINATE.fullmatch(name.strip()):
-        return Place(x=float(match[1]), y=float(match[2]), z=float(match[3] or 0.0))
-    return None if site is None else locate(_bare(name), site)
+    found = coordinate(name)
+    return found if found is not None or site is None else locate(bare(name), site)
 
 
 def known_as(name: str, site: Site | None) -> tuple[str, ...]:
@@ -32,7 +53,7 @@ def known_as(name: str, site: Site | None) -> tuple[str, ...]:
     A coordinate has the names of the places within `SAME_SPOT_M`, the nearest first. A text that names no place of the
     site has itself alone.
     """
-    own = _bare(name)
+    own = bare(name)
     spot = spot_of(name, site)
     if site is None or spot is None:
         return (own,)
@@ -49,10 +70,125 @@ def known_as(name: str, site: Site | None) -> tuple[str, ...]:
 def parts_of(text: str) -> list[str]:
     """Return what a text names: itself, and the places of it if it is a route such as "goal 1, aisle then (12, 7)"."""
     parts = [text, *_IN_BRACKETS.findall(text)]
-    if not _COORDINATE.fullmatch(text.strip()):
+    if not COORDINATE.fullmatch(text.strip()):
         parts += _SPLIT.split(_IN_BRACKETS.sub(";", text))
-    return list(dict.fromkeys(name for each in parts[:MOST_PARTS] if (name := _bare(each))))
+    return list(dict.fromkeys(name for each in parts[:MOST_PARTS] if (name := bare(each))))
 
 
-def _bare(name: str) -> str:
+def bare(name: str) -> str:
+    """Return a name as the site's keys are written, without marks around it."""
     return plain_name(name.strip(" .!?\"'"))
+
+
+def nearest(name: str, site: Site) -> str:
+    """Return the known name that is most like an unknown one; "" when none is like it."""
+    import difflib  # noqa: PLC0415 - only for a plan that is refused
+
+    names = [each for key, place in site.places.items() for each in (key, *place.aliases)]
+    found = difflib.get_close_matches(bare(name), names, n=1, cutoff=0.6)
+    return found[0] if found else ""
+
+
+def extent(site: Site) -> Box | None:
+    """Return the fence; where there is none, None."""
+    return site.fence
+
+
+def outside(place: Place, site: Site) -> str:
+    """Return why a point cannot be gone to: outside the fence, or above or below what the site allows; "" if it can."""
+    fence = site.fence
+    if fence is not None and not (fence.x[0] <= place.x <= fence.x[1] and fence.y[0] <= place.y <= fence.y[1]):
+        return (
+            f"lies outside the fence {fence.name} "
+            f"(x {fence.x[0]:g} to {fence.x[1]:g} m, y {fence.y[0]:g} to {fence.y[1]:g} m)"
+        )
+    if fence is None and (far := _far(place, site)):
+        return far
+    if place.z > site.altitude_limit_m:
+        return f"is {place.z:g} m up, above this site's limit of {site.altitude_limit_m:g} m"
+    if place.z < 0:
+        return f"is {-place.z:g} m under the ground"
+    return ""
+
+
+FAR_M = 200.0
+"""Without a fence a coordinate further than this from all mapped places is taken for a mistake, as the skills do."""
+
+
+def _far(place: Place, site: Site) -> str:
+    xs = [each.x for each in site.places.values()] or [0.0]
+    ys = [each.y for each in site.places.values()] or [0.0]
+    if min(xs) - FAR_M <= place.x <= max(xs) + FAR_M and min(ys) - FAR_M <= place.y <= max(ys) + FAR_M:
+        return ""
+    return f"lies more than {FAR_M:g} m outside the site"
+
+
+def geographic(place: Place, text: str, site: Site) -> bool:
+    """Whether a pair of numbers is a latitude and longitude: near the site's own, with the decimals of degrees."""
+    decimals = [len(each.partition(".")[2]) for each in re.findall(r"\d+\.\d+", text)]
+    near = abs(place.x - site.latitude_deg) < GEOGRAPHIC_DEG and abs(place.y - site.longitude_deg) < GEOGRAPHIC_DEG
+    swapped = abs(place.y - site.latitude_deg) < GEOGRAPHIC_DEG and abs(place.x - site.longitude_deg) < GEOGRAPHIC_DEG
+    return (near or swapped) or (len(decimals) >= 2 and min(decimals) >= 4)
+
+
+def place_problems(subtask: Subtask, site: Site, *, moves: bool = True) -> Iterable[str]:
+    """Return what is wrong with where a subtask goes, and with its height and speed, each with a remedy."""
+    params = subtask.params
+    place = params.get("place")
+    if moves and isinstance(place, str) and place:
+        yield from _place(place, site)
+    for key in ("path", "area", "target", "asset"):
+        text = params.get(key)
+        if moves and isinstance(text, str):
+            for part in (text, *_IN_BRACKETS.findall(text)):
+                found = coordinate(part)
+                if found is not None:
+                    yield from _point(found, part, site)
+    altitude = params.get("altitude_m")
+    if _number(altitude) and altitude > site.altitude_limit_m:
+        yield f"altitude {altitude:g} m is above this site's limit of {site.altitude_limit_m:g} m"
+    speed = params.get("speed_mps")
+    if _number(speed) and speed > site.speed_limit_mps:
+        yield f"speed {speed:g} m/s is above this site's limit of {site.speed_limit_mps:g} m/s"
+
+
+def _place(name: str, site: Site) -> Iterable[str]:
+    from appliance.llm.checks.schema import shown  # noqa: PLC0415 - schema asks for places, too
+
+    found = locate(name, site)
+    if found is None:
+        like = nearest(name, site)
+        hint = f"; nearest name: {like}" if like else ""
+        known = ", ".join(sorted(site.places)[:12])
+        yield f"there is no place {shown(name)} on site {site.name}{hint}: it knows {known}"
+        return
+    yield from _point(found, name, site)
+
+
+def _point(found: Place, name: str, site: Site) -> Iterable[str]:
+    from appliance.llm.checks.schema import shown  # noqa: PLC0415
+
+    if coordinate(name) is not None and geographic(found, name, site):
+        yield f"place {shown(name)} looks like latitude and longitude: give metres of the site, or a place's name"
+    elif coordinate(name) is not None and (why := outside(found, site)):
+        yield f"place {shown(name)} {why}: choose a point on the site"
+    elif (box := inside(found, site.forbidden)) is not None:
+        yield f"place {shown(name)} lies in the forbidden area {box.name}: choose another"
+    elif (box := inside(found, site.obstacles)) is not None:
+        yield f"place {shown(name)} lies inside {box.name}: choose a free one"
+
+
+def inside(place: Place, boxes: Sequence[Box]) -> Box | None:
+    """Return the first box that a point lies in, or None."""
+    for box in boxes:
+        if box.x[0] <= place.x <= box.x[1] and box.y[0] <= place.y <= box.y[1]:
+            return box
+    return None
+
+
+def _number(value: Any) -> TypeGuard[float]:
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and math.isfinite(float(value) if abs(value) < 1e15 else math.inf)
+    )

@@ -9,11 +9,12 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from appliance.llm.checks.contradiction import contradictions, precedes
+from appliance.llm.checks.contradiction import precedes
+from appliance.llm.checks.finding import Facts, Finding, Severity
 from appliance.llm.checks.places import known_as, parts_of, spot_of
+from appliance.llm.checks.schema import MAX_PROBLEMS, able, is_unnamed, shown
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.llm.settings import PlanContext
-from appliance.llm.checks.schema import MAX_PROBLEMS, able, is_unnamed, shown
 from appliance.model import Plan, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue
 
@@ -47,7 +48,6 @@ def unsafe(plan: Plan, context: PlanContext, catalogue: Catalogue, config: Safet
     for subtask in plan.subtasks:
         where = f"{shown(subtask.id)} ({shown(subtask.skill)})"
         problems += [f"{where}: {text}" for text in _subtask(subtask, context, catalogue, config)]
-    problems += contradictions(plan)
     problems += _exclusive(plan, context, catalogue, config)
     return tuple(problems[:MAX_PROBLEMS])
 
@@ -236,3 +236,14 @@ def _forbidden(name: str, site: Site) -> str:
         return ""
     inside = (box for box in site.forbidden if box.x[0] <= found.x <= box.x[1] and box.y[0] <= found.y <= box.y[1])
     return next((box.name for box in inside), "")
+
+
+def policy_holds(facts: Facts) -> Iterable[Finding]:
+    """Skills that the policy has approved each time (`safety.confirm_skills`)."""
+    skills = sorted({each.skill for each in facts.plan.subtasks if matched(each.skill, facts.safety.confirm_skills)})
+    if skills:
+        yield Finding(
+            check="approval",
+            severity=Severity.HOLD,
+            message=f"{', '.join(skills)} needs approval (safety.confirm_skills)",
+        )

@@ -10,25 +10,66 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from appliance.llm.language.plurals import singular
 from appliance.model import RobotInfo
 
 MAX_TOKENS = 4000
 """Longer texts are cut: `intake` refuses them before."""
-_ONES = (
-    "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen "
-    "eighteen nineteen"
-).split()
-NUMBERS = {word: number for number, word in enumerate(_ONES)}
-NUMBERS |= {
+_ONES = [
+    "zero",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+    "thirteen",
+    "fourteen",
+    "fifteen",
+    "sixteen",
+    "seventeen",
+    "eighteen",
+    "nineteen",
+]
+_TENS = {
     word: 10 * tens
-    for tens, word in enumerate("twenty thirty forty fifty sixty seventy eighty ninety".split(), start=2)
+    for tens, word in enumerate(["twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety"], start=2)
 }
+NUMBERS = {word: number for number, word in enumerate(_ONES)} | _TENS
+"""Number words, to ninety."""
 KINDS = frozenset(
-    "robot drone rover uav ugv auv bot cart arm unit vehicle machine copter quadcopter quad amr agv tug loader truck "
-    "forklift crawler".split()
+    [
+        "robot",
+        "drone",
+        "rover",
+        "uav",
+        "ugv",
+        "auv",
+        "bot",
+        "cart",
+        "arm",
+        "unit",
+        "vehicle",
+        "machine",
+        "copter",
+        "quadcopter",
+        "quad",
+        "amr",
+        "agv",
+        "tug",
+        "loader",
+        "truck",
+        "forklift",
+        "crawler",
+    ]
 )
 """Nouns for robots."""
 _GENERAL = frozenset(("robot", "bot", "unit", "vehicle", "machine"))
@@ -77,6 +118,8 @@ class Reading(Struct, frozen=True, kw_only=True):
     """Invisible characters that were removed."""
     mixed: tuple[str, ...] = ()
     """Words that mix letters of several scripts."""
+    memo: dict[tuple[str, str, str], frozenset[int] | None] = field(default_factory=dict)
+    """What was found in it before, by kind, value and unit: plans for one instruction say much the same."""
 
     @property
     def named(self) -> frozenset[str]:
@@ -108,16 +151,22 @@ def stem(word: str) -> str:
 
 
 def read(instruction: str, robots: Sequence[RobotInfo] | None, names: Iterable[str] = ()) -> Reading:
-    """Read an instruction.
+    """Read an instruction; the reading is kept for the next plan of the same words and robots.
 
     Args:
         instruction: as it was typed.
         robots: the roster; None when it is unknown.
         names: robots that a plan names, which count as names where the roster is unknown.
     """
+    roster = None if robots is None else tuple((each.id, each.flies) for each in robots)
+    return _read(instruction, roster, tuple(sorted(set(names))) if robots is None else ())
+
+
+@lru_cache(maxsize=32)
+def _read(instruction: str, robots: "tuple[_Robot, ...] | None", names: tuple[str, ...]) -> Reading:
     text, hidden = normalise(instruction)
     plain = [_token(match) for match in _TOKEN.finditer(text)][:MAX_TOKENS]
-    known = [each.id for each in robots] if robots is not None else sorted(set(names))
+    known = [robot for robot, _ in robots] if robots is not None else names
     tokens = _groups(_named(plain, known), robots)
     sentence: list[int] = []
     number = 0
@@ -184,9 +233,7 @@ def _named(tokens: list[Token], known: Sequence[str]) -> list[Token]:
                     named = [*named, robot] if stop == end else [robot]
                     end = stop
         if named:
-            found.append(
-                Token(named[0], "robot", token.start, tokens[end - 1].end, robots=tuple(named), group="one")
-            )
+            found.append(Token(named[0], "robot", token.start, tokens[end - 1].end, robots=tuple(named), group="one"))
             at = end
         else:
             found.append(token)
@@ -212,20 +259,24 @@ def _matches(tokens: Sequence[Token], at: int, parts: Sequence[str]) -> int:
     return index
 
 
-def kind_of(robot: RobotInfo) -> str:
-    """Return the noun in a robot's id: `drone` of drone_3; empty when there is none."""
-    return next((part for part in _parts(robot.id) if part in KINDS), "")
+_Robot = tuple[str, bool]
+"""Id, and whether it flies."""
 
 
-def _of_kind(kind: str, robots: Sequence[RobotInfo]) -> tuple[str, ...]:
+def _kind_of(robot: str) -> str:
+    """The noun in a robot's id: `drone` of drone_3; empty when there is none."""
+    return next((part for part in _parts(robot) if part in KINDS), "")
+
+
+def _of_kind(kind: str, robots: Sequence[_Robot]) -> tuple[str, ...]:
     if kind in _GENERAL:
-        return tuple(each.id for each in robots)
+        return tuple(name for name, _ in robots)
     if kind in _FLYING:
-        return tuple(each.id for each in robots if each.flies or kind_of(each) == kind)
-    return tuple(each.id for each in robots if kind_of(each) == kind)
+        return tuple(name for name, flies in robots if flies or _kind_of(name) == kind)
+    return tuple(name for name, _ in robots if _kind_of(name) == kind)
 
 
-def _groups(tokens: list[Token], robots: Sequence[RobotInfo] | None) -> list[Token]:
+def _groups(tokens: list[Token], robots: Sequence[_Robot] | None) -> list[Token]:
     """Join the tokens that mean robots without a name: "all drones", "both of them", "the rover", "a robot"."""
     found: list[Token] = []
     at = 0
@@ -241,13 +292,13 @@ def _groups(tokens: list[Token], robots: Sequence[RobotInfo] | None) -> list[Tok
 
 
 def _group(
-    tokens: Sequence[Token], at: int, robots: Sequence[RobotInfo] | None, before: Sequence[Token]
+    tokens: Sequence[Token], at: int, robots: Sequence[_Robot] | None, before: Sequence[Token]
 ) -> tuple[int, Token | None]:
     token = tokens[at]
     if token.kind != "word":
         return at, None
     roster = tuple(robots or ())
-    everyone = tuple(each.id for each in roster)
+    everyone = tuple(name for name, _ in roster)
 
     def made(stop: int, which: tuple[str, ...], group: str) -> tuple[int, Token]:
         text = " ".join(each.text for each in tokens[at:stop])
@@ -263,6 +314,8 @@ def _group(
     other = False
     while index < len(tokens) and tokens[index].kind in ("word", "number") and index - at < 6:
         word = tokens[index].text
+        if other and word == "one":
+            break
         if word in _GROUP or (word in _ONE_OF and not lead):
             lead = lead or word
         elif tokens[index].value is not None and index > at - 1 and word not in KINDS:
@@ -274,26 +327,29 @@ def _group(
             break
         index += 1
     noun = tokens[index].text if index < len(tokens) and tokens[index].kind == "word" else ""
-    kind = noun if noun in KINDS else stem(noun)
+    kind = "robot" if other and noun == "one" else noun if noun in KINDS else stem(noun)
     if noun in ("them", "us", "you") and lead in _GROUP and index > at:
         earlier = tuple(dict.fromkeys(r for each in before if each.group == "one" for r in each.robots))
         return made(index + 1, earlier or everyone, "all")
     if kind in KINDS and not (index + 1 < len(tokens) and tokens[index + 1].value is not None):
-        plural = noun != kind
         which = _of_kind(kind, roster)
-        named = {robot for each in before if each.group == "one" for robot in each.robots}
         if other:
+            named = {robot for each in before if each.group == "one" for robot in each.robots}
             which = tuple(each for each in which if each not in named)
-        if lead in _GROUP or (plural and (lead in ("the", "") and (count is None or count == len(which)))):
-            if lead == "either":
-                return made(index + 1, which, "any")
-            return made(index + 1, which, "all")
-        if plural:
-            return made(index + 1, which, "all" if count == len(which) else "any")
-        if lead == "the":
-            return made(index + 1, which, "one" if len(which) == 1 else "any")
-        if lead in _ONE_OF or count == 1:
-            return made(index + 1, which, "any")
-    if lead in ("both",) and index == at + 1 and len(everyone) == 2 and noun not in KINDS:
+        group = _meant(lead, count, plural=noun != kind, number=len(which))
+        if group:
+            return made(index + 1, which, group)
+    if lead == "both" and index == at + 1 and len(everyone) == 2 and noun not in KINDS:
         return made(at + 1, everyone, "all")
     return at, None
+
+
+def _meant(lead: str, count: float | None, *, plural: bool, number: int) -> str:
+    """Whether a noun for robots means `all` of its kind, `one` that is clear, or `any`; empty when it means none."""
+    if lead in _GROUP:
+        return "all"
+    if plural:
+        return "all" if count == number or (count is None and lead in ("the", "")) else "any"
+    if lead == "the":
+        return "one" if number == 1 else "any"
+    return "any" if lead in _ONE_OF or count == 1 else ""

@@ -1,7 +1,7 @@
 """Whether a plan may run: the one check every tier's plan, and every plan handed in from outside, must pass.
 
 Why it exists: a language model proposes, this decides. It is deterministic and pure, it can only refuse, and it says
-everything that is wrong at once, each as a sentence with subtask and remedy, so that a model can mend its plan and a
+everything that is wrong at once, each as a sentence with subtask and remedy, so that a model can correct its plan and a
 person understands the refusal. It must survive any plan that decodes at all, so every walk over it is bounded and
 none recurses.
 """
@@ -9,9 +9,10 @@ none recurses.
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeGuard
+from typing import Any
 
-from appliance.model import Box, Place, Plan, RobotInfo, Site, Subtask
+from appliance.llm.checks.places import place_problems
+from appliance.model import Plan, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue, Param, SkillManifest
 
 MAX_SUBTASKS = 64
@@ -30,9 +31,6 @@ _ID = re.compile(r"[a-z][a-z0-9_]{0,30}")
 _ROBOT = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
 _PLAIN = re.compile(r"[a-z0-9_.-]{1,40}")
 _ANY = re.compile(r"any\d{0,2}")
-_COORDINATE = re.compile(
-    r"\(?\s*(?:x\s*=?\s*)?(-?\d{1,6}(?:\.\d+)?)\s*[,; ]\s*(?:y\s*=?\s*)?(-?\d{1,6}(?:\.\d+)?)\s*\)?"
-)
 
 
 def validate(
@@ -75,7 +73,7 @@ def validate(
         problems += [f"{where}: {text}" for text in _params(subtask, manifest)]
         problems += [f"{where}: {text}" for text in _robot(subtask, manifest, roster)]
         if site is not None:
-            problems += [f"{where}: {text}" for text in _limits(subtask, site)]
+            problems += [f"{where}: {text}" for text in place_problems(subtask, site)]
         if len(problems) > MAX_PROBLEMS:
             break
     if roster is not None and not problems:
@@ -99,15 +97,6 @@ def able(robot: RobotInfo, manifest: SkillManifest) -> str:
 def is_unnamed(robot: str) -> bool:
     """Whether a robot is a label for one that is yet to be chosen: any, any1, ..."""
     return _ANY.fullmatch(robot) is not None
-
-
-def locate(name: str, site: Site) -> Place | None:
-    """Return the place a text names: a place of the site, or a coordinate such as "12.5, 7" (metres)."""
-    if found := site.find(name):
-        return found
-    if match := _COORDINATE.fullmatch(name.strip()):
-        return Place(x=float(match[1]), y=float(match[2]))
-    return None
 
 
 def _ids(plan: Plan) -> Iterable[str]:
@@ -266,37 +255,6 @@ def _assign(name: str, fits: dict[str, list[str]], taken: dict[str, str]) -> boo
                     robot = previous  # noqa: PLW2901 - walks the path back
             queue.append(taken[robot])
     return False
-
-
-def _limits(subtask: Subtask, site: Site) -> Iterable[str]:
-    params = subtask.params
-    place = params.get("place")
-    if isinstance(place, str) and place:
-        found = locate(place, site)
-        if found is None:
-            near = ", ".join(sorted(site.places)[:12])
-            yield f"there is no place {shown(place)} on site {site.name}: it knows {near}"
-        elif (box := _inside(found, site.forbidden)) is not None:
-            yield f"place {shown(place)} lies in the forbidden area {box.name}: choose another"
-        elif (box := _inside(found, site.obstacles)) is not None:
-            yield f"place {shown(place)} lies inside {box.name}: choose a free one"
-    altitude = params.get("altitude_m")
-    if _number(altitude) and altitude > site.altitude_limit_m:
-        yield f"altitude {altitude:g} m is above this site's limit of {site.altitude_limit_m:g} m"
-    speed = params.get("speed_mps")
-    if _number(speed) and speed > site.speed_limit_mps:
-        yield f"speed {speed:g} m/s is above this site's limit of {site.speed_limit_mps:g} m/s"
-
-
-def _number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and _within(value)
-
-
-def _inside(place: Place, boxes: Sequence[Box]) -> Box | None:
-    for box in boxes:
-        if box.x[0] <= place.x <= box.x[1] and box.y[0] <= place.y <= box.y[1]:
-            return box
-    return None
 
 
 def shown(value: Any) -> str:

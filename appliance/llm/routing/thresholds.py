@@ -20,17 +20,15 @@ STEP = 0.05
 
 
 class Thresholds:
-    """Of all tiers, and the one below which a plan waits for an operator.
+    """The confidence from which each tier's plans run unasked.
 
     Args:
         base: what is configured, by tier.
-        confirm_below: what is configured for confirmation.
         clock: seconds.
     """
 
-    def __init__(self, base: Mapping[str, float], *, confirm_below: float, clock: Callable[[], float]) -> None:
+    def __init__(self, base: Mapping[str, float], *, clock: Callable[[], float]) -> None:
         self._base = dict(base)
-        self._confirm = confirm_below
         self._clock = clock
         self._seen: dict[str, deque[tuple[float, bool, float]]] = {}
         """Tier -> (confidence, whether it turned out well, when)."""
@@ -44,13 +42,6 @@ class Thresholds:
         """Return the confidence from which a plan of a tier is taken; 0 for one that has none."""
         base = self._base.get(tier, 0.0)
         return self._moved(base, list(self._seen.get(tier, ())))
-
-    @property
-    def confirm_below(self) -> float:
-        """The confidence below which a plan waits for an operator; with 0 configured none does."""
-        if self._confirm <= 0:
-            return 0.0
-        return self._moved(self._confirm, [each for seen in self._seen.values() for each in seen])
 
     @property
     def all(self) -> dict[str, float]:

@@ -11,8 +11,8 @@ from typing import Any
 from msgspec import Struct, field
 
 from appliance.errors import PlanError
-from appliance.llm.rules.phrases import Step
 from appliance.llm.checks.schema import MAX_SUBTASKS
+from appliance.llm.rules.phrases import Step
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
 

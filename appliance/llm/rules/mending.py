@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from appliance.errors import PlanError
-from appliance.llm.so_far import SoFar, Step
 from appliance.llm.checks.schema import able
+from appliance.llm.so_far import SoFar, Step
 from appliance.model import Plan, RobotInfo, Subtask, Tier
 from appliance.skills.catalogue import Catalogue, SkillManifest
 

@@ -43,9 +43,9 @@ class SafetyConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     grounded: bool = True
     """Refuse a model's plan that names a robot, place, object or text of which the instruction says nothing: neither
     invention nor what was slipped into names and notes of robots becomes a subtask."""
-    confirm_below: Annotated[float, Meta(ge=0, le=1)] = 0.5
-    """A plan that its tier is less sure of waits until an operator agrees; experience can raise it. Half: as likely
-    wrong as right. 0: none waits."""
+    choose_robot: Literal["ask", "auto"] = "ask"
+    """What becomes of an order that names no robot where several can do it: `ask` holds the plan until an operator
+    approves the choice, `auto` lets the scheduler choose. Where only one robot can do it, that one does."""
     confirm_skills: tuple[Pattern, ...] = ()
     """Shell patterns of skills with which every plan waits until an operator agrees, such as `cut`."""
 

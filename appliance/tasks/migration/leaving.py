@@ -119,7 +119,7 @@ class Leaving:
         if when == "never" and here.began:
             raise RefusedError(
                 f"{here.request.skill} commands a robot and may not be moved",
-                remedy="wait for its end; `moves` in its manifest says otherwise where it can be",
+                remedy="wait until it ends; its manifest says that it must not migrate (`migratable`)",
             )
         self._lift(run.run_id)
         self._holds[run.run_id] = _Hold(time.monotonic() + self._config.hold_s, asyncio.Event())

@@ -199,7 +199,7 @@ class Moving:
         if manifest.mobility == "never" and target.state is SubtaskState.RUNNING:
             raise RefusedError(
                 f"{target.subtask.skill} commands a robot and may not be moved",
-                remedy="wait for its end; `moves` in its manifest says otherwise where it can be",
+                remedy="wait until it ends; its manifest says that it must not migrate (`migratable`)",
             )
         request = request_for(
             driver.record, target, manifest, robot=target.bound_robot, coordinator=self._plane.gateway

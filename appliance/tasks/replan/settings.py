@@ -25,10 +25,6 @@ class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """New plans of the decomposer for one task; if two did not help, a person should look."""
     max_revisions: int = 6
     """All revisions of one task's plan."""
-    confirm_below: float = 0.6
-    """A new plan that the decomposer is less sure of waits until an operator agrees (`swiftbot task agree`): nobody
-    has seen it, unlike a first plan. 0: none waits; above 1: each does. In a task whose first plan somebody confirmed
-    (terminal UI) each does as well."""
     confirm_s: float = 600.0
     """How long it waits; then the task fails."""
     ask_s: float = 90.0

@@ -12,7 +12,9 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, Static
 
 from appliance.errors import PlanError, SwiftbotError
+from appliance.llm.stop_words import stop_request
 from appliance.model import Approval, Site, TaskRecord, TaskRequest
+from appliance.stopping import unknown_text
 from appliance.tasks.api import PlanAnswer
 from appliance.tui.action import key_name
 from appliance.tui.data import View
@@ -20,6 +22,7 @@ from appliance.tui.keys import DIALOG_KEYS
 from appliance.tui.plans import shape
 from appliance.tui.plans.completing import common, completions
 from appliance.tui.plans.history import History
+from appliance.tui.robots.actions import stop_these
 from appliance.tui.safe import safe
 from appliance.tui.tasks.facts import plan_lines
 from appliance.tui.widgets import Field, Pane
@@ -81,6 +84,7 @@ class InstructionInput(Field):
 def answer_text(answer: PlanAnswer) -> Text:
     """Draw the answer to a question for a plan: the plan, and what each tier that was asked made of it."""
     plan = answer.plan
+    holds = plan.provenance.confirm if plan.provenance is not None else ()
     count = len(plan.subtasks)
     out = Text()
     out.append(
@@ -89,6 +93,8 @@ def answer_text(answer: PlanAnswer) -> Text:
         "bold",
     )
     out.append_text(plan_lines(plan.subtasks))
+    for why in holds:
+        out.append(f"! {safe(why, 300)}\n", "bold yellow")
     for attempt in answer.attempts:
         if not attempt.ok:
             out.append(f"{attempt.tier} tier: {safe('; '.join(attempt.problems), 300)}\n", "dim")
@@ -170,6 +176,8 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
             return
         if not instruction:
             self._show(Text("Write an instruction first.", "yellow"), _ASK)
+        elif (stop := stop_request(instruction, sorted(self._view.store.robots))) is not None:
+            self._stop(stop.robots, stop.unknown, instruction)
         elif self._answer is None:
             self._plan(instruction)
         else:
@@ -179,6 +187,21 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         """Submit the plan so that it waits: it is edited and approved on a screen of its own."""
         if self._answer is not None and not self._busy:
             self._submit(self._planned, self._answer, Approval.ALWAYS)
+
+    @work(exclusive=True)
+    async def _stop(self, robots: tuple[str, ...], unknown: tuple[str, ...], instruction: str) -> None:
+        """A text that says to stop is the soft stop, at once; it is no task."""
+        self._busy = True
+        roster = sorted(self._view.store.robots)
+        text = Text("".join(f"{safe(unknown_text(name, roster))}\n" for name in unknown), "red")
+        try:
+            if robots or not unknown:
+                text.append(await stop_these(self._view.orders, robots, instruction), "bold red")
+        except SwiftbotError as error:
+            text.append(f"✘ {safe(error.message)}\n→ {safe(error.remedy)}", "red")
+        finally:
+            self._busy = False
+        self._show(text, "Esc leaves")
 
     @work(exclusive=True)
     async def _plan(self, instruction: str) -> None:

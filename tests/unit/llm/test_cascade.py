@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
-from appliance.errors import ConfigError, PlanError, UnreachableError
+from appliance.errors import ConfigError, PlanError, RefusedError, UnreachableError
 from appliance.llm.cascade import Decomposer, Slot
 from appliance.llm.rules.tier import RulesTier
+from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
 from appliance.model import Plan, RobotInfo, Site, Subtask, Tier
@@ -78,7 +79,6 @@ def build(catalogue: Catalogue) -> Build:
             Slot(
                 planner=tier,
                 deadline_s=deadline_s,
-                min_confidence=0.6,
                 max_words=max_words if tier.name is Tier.LOCAL else 50,
                 leaves_machine=tier.name is Tier.UPSTREAM,
             )
@@ -166,77 +166,66 @@ async def test_unsure_plan_is_kept_for_when_nothing_better_comes(build: Build) -
 
 
 @pytest.mark.parametrize(
-    ("likely", "tier"),
+    ("confidence", "tier", "held"),
     [
-        pytest.param(0.3, Tier.LOCAL, id="the model's is likelier to be right"),
-        pytest.param(0.6, Tier.LOCAL, id="hardly likelier: the model's is nearer when it is wrong"),
-        pytest.param(0.8, Tier.RULES, id="the rules' is likelier"),
-        pytest.param(None, Tier.RULES, id="a tier that says no more than its confidence"),
+        pytest.param(0.3, Tier.LOCAL, True, id="the model's is likelier to be right"),
+        pytest.param(0.55, Tier.RULES, True, id="the rules' is likelier, and unsure as well"),
+        pytest.param(0.8, Tier.RULES, False, id="the rules' is sure"),
     ],
 )
 async def test_of_an_unsure_model_and_the_rules_the_likelier_is_taken(
-    build: Build, likely: float | None, tier: Tier
+    build: Build, confidence: float, tier: Tier, held: bool
 ) -> None:
-    """What share of the words the rules understood is no probability: like is compared with like."""
+    """All tiers are sure on one scale: the likelier plan is taken, and what is unsure never runs unasked."""
     local = FakeTier(Tier.LOCAL, sure(going("dock 1"), 0.5))
-    rules = FakeTier(Tier.RULES, Proposal(plan=going("dock"), confidence=1.0, likely=likely))
-    outcome = await build(local, rules).plan(ASK)
+    outcome = await build(local, FakeTier(Tier.RULES, sure(going("dock 1"), confidence))).plan(ASK)
     assert outcome.plan.tier is tier
-    assert outcome.plan.confidence == (0.5 if tier is Tier.LOCAL else 1.0)
-    assert [attempt.ok for attempt in outcome.attempts] == [tier is Tier.LOCAL, tier is Tier.RULES]
-    if tier is Tier.LOCAL:
-        assert outcome.attempts[1].problems == ("the plan of local is taken: 0.50 sure with this one beside it",)
-
-
-async def test_a_plan_that_two_planners_made_is_surer(build: Build) -> None:
-    """The model was not sure enough, and the rules, which know nothing of it, say the same: nobody need be asked."""
-    local = FakeTier(Tier.LOCAL, sure(going(), 0.3))
-    rules = FakeTier(Tier.RULES, Proposal(plan=going(), confidence=1.0, likely=0.2))
-    outcome = await build(local, rules).plan(ASK)
-    assert (outcome.plan.tier, outcome.plan.confidence) == (Tier.LOCAL, 0.9)
     assert outcome.plan.provenance is not None
-    assert not outcome.plan.provenance.confirm
+    assert bool(outcome.plan.provenance.confirm) is held
 
 
-async def test_rules_need_not_be_likely_where_no_model_has_a_plan(build: Build) -> None:
-    """A sentence that was understood word for word is carried out: there is nothing to compare it with."""
-    rules = FakeTier(Tier.RULES, Proposal(plan=going(), confidence=1.0, likely=0.1))
-    outcome = await build(FakeTier(Tier.LOCAL, sure(going(), 0.05)), rules).plan(ASK)
-    assert outcome.plan.tier is Tier.RULES
-
-
-async def test_no_threshold_is_low_enough_for_a_doubtful_plan(catalogue: Catalogue) -> None:
-    """With a threshold of 0 any plan is sure enough but one that breaks a rule of plans: the next is asked first."""
-    two = PlanContext(instruction="go to dock 1, or to dock 2")
-    doubtful = Proposal(plan=going("dock 2"), confidence=0.4, doubtful=True)
-    for answer, other, tier, asked in (
-        (Proposal(plan=going("dock 2"), confidence=0.0), sure(going()), Tier.LOCAL, 0),
-        (doubtful, sure(going()), Tier.UPSTREAM, 1),
-        (doubtful, UnreachableError("gone"), Tier.LOCAL, 1),
+async def test_no_threshold_is_low_enough_for_a_plan_that_a_check_holds(catalogue: Catalogue) -> None:
+    """With a threshold of 0 any plan is sure enough but one that a check holds: then the next tier is asked."""
+    for place, other, tier, asked, held in (
+        ("dock 1", sure(going()), Tier.LOCAL, 0, False),
+        ("dock 2", sure(going()), Tier.UPSTREAM, 1, False),
+        ("dock 2", UnreachableError("gone"), Tier.LOCAL, 1, True),
     ):
+        answer = Proposal(plan=going(place), confidence=0.4)
         local, upstream = FakeTier(Tier.LOCAL, answer), FakeTier(Tier.UPSTREAM, other)
-        slots = [Slot(planner=each, deadline_s=60.0, min_confidence=0.0) for each in (local, upstream)]
-        outcome = await Decomposer(LlmConfig(), catalogue, slots=slots).plan(two)
+        slots = [Slot(planner=each, deadline_s=60.0) for each in (local, upstream)]
+        config = LlmConfig(run_confidence=0.0, show_confidence=0.0, repair=False)
+        decomposer = Decomposer(config, catalogue, slots=slots, safety=SafetyConfig(grounded=False))
+        outcome = await decomposer.plan(ASK)
         assert (outcome.plan.tier, len(upstream.asked)) == (tier, asked)
-        if answer is doubtful:
-            assert "breaks a rule" in outcome.attempts[0].problems[0]
+        assert outcome.plan.provenance is not None
+        assert bool(outcome.plan.provenance.confirm) is held
 
 
-async def test_what_is_measured_may_be_doubtful(catalogue: Catalogue) -> None:
-    """A slot can be told to take such a plan, so that what the tier proposes can be scored."""
-    local = FakeTier(Tier.LOCAL, Proposal(plan=going(), confidence=0.4, doubtful=True))
-    upstream = FakeTier(Tier.UPSTREAM)
-    slots = [
-        Slot(planner=local, deadline_s=60.0, min_confidence=0.0, takes_doubtful=True),
-        Slot(planner=upstream, deadline_s=60.0, min_confidence=0.0),
-    ]
-    outcome = await Decomposer(LlmConfig(), catalogue, slots=slots).plan(ASK)
-    assert (outcome.plan.tier, upstream.asked) == (Tier.LOCAL, [])
+@pytest.mark.parametrize(
+    "instruction", ["stop", "STOP!", "Rover_1: stop", "emergency stop", "alto", "Rover_1 go to dock 1. STOP!"]
+)
+async def test_a_stop_reaches_no_planner(build: Build, instruction: str) -> None:
+    """A text that says to stop is refused with the command, and no tier is asked."""
+    local = FakeTier(Tier.LOCAL, sure(going()))
+    with pytest.raises(RefusedError, match="this is a stop") as caught:
+        await build(local).plan(PlanContext(instruction=instruction))
+    assert "swiftbot stop" in caught.value.remedy
+    assert local.asked == []
+
+
+@pytest.mark.parametrize("tier", [Tier.LOCAL, Tier.PEER, Tier.UPSTREAM, Tier.RULES])
+async def test_what_the_words_forbid_runs_from_no_tier(build: Build, tier: Tier) -> None:
+    """The same review holds for each tier: a plan that does what the words forbid is refused, whoever made it."""
+    with pytest.raises(PlanError, match="forbids this action"):
+        await build(FakeTier(tier, sure(going(), 1.0), sure(going(), 1.0))).plan(
+            PlanContext(instruction="do not go to dock 1")
+        )
 
 
 async def test_very_unsure_plan_is_not_taken(build: Build) -> None:
     """Below the floor even a valid plan is refused."""
-    with pytest.raises(PlanError, match=r"confidence 0\.05 is below 0\.60"):
+    with pytest.raises(PlanError, match=r"0\.05 sure"):
         await build(FakeTier(Tier.LOCAL, sure(going(), 0.05))).plan(ASK)
 
 
@@ -301,7 +290,7 @@ async def test_without_models_the_rules_plan_alone(
             ("Drone_1 take off to 90 m", "limit of 30 m"),
             ("colourless green ideas", "not understood"),
             ("asdf", "not understood"),
-            ("If the door is open, go to the shelf", "below 0.97"),
+            ("If the door is open, go to the shelf", "does not wait for"),
         ):
             with pytest.raises(PlanError, match=said) as caught:
                 await cascade.plan(PlanContext(instruction=text, robots=robots, site=site))
@@ -313,7 +302,7 @@ async def test_without_models_the_rules_plan_alone(
 
 async def test_rules_never_carry_out_half_an_order(catalogue: Catalogue) -> None:
     """A plan by rules below their threshold is refused even when nothing else answers."""
-    slot = Slot(planner=RulesTier(catalogue), deadline_s=5, min_confidence=0.8, fallback=False)
+    slot = Slot(planner=RulesTier(catalogue), deadline_s=5)
     with pytest.raises(PlanError, match="not understood"):
         await Decomposer(LlmConfig(), catalogue, slots=[slot]).plan(
             PlanContext(instruction="Go to the shelf. Abracadabra simsalabim hocus pocus.")
@@ -326,7 +315,7 @@ async def test_rules_never_carry_out_half_an_order(catalogue: Catalogue) -> None
         {"tiers": ("oracle",)},
         {"tiers": ()},
         {"tiers": ("rules", "rules")},
-        {"rules_min_confidence": 2.0},
+        {"run_confidence": 2.0},
         {"upstream_deadline_s": 0.0},
         {"upstream_retries": 50},
         {"upstream_url": "ftp://x", "upstream_model": "m"},

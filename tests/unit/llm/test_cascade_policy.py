@@ -46,7 +46,7 @@ def build(catalogue: Catalogue) -> Build:
             Slot(
                 planner=tier,
                 deadline_s=5.0,
-                min_confidence=0.6,
+
                 leaves_machine=tier.name in (Tier.UPSTREAM, Tier.PEER),
                 instead_of=Tier.LOCAL if tier.name is Tier.PEER else None,
             )
@@ -135,18 +135,18 @@ async def test_thresholds_move_with_what_becomes_of_plans(build: Build) -> None:
     assert cascade.status.thresholds["local"] > 0.65
     outcome = await cascade.plan(ASK)
     assert outcome.plan.tier is Tier.UPSTREAM
-    assert "is below" in outcome.attempts[0].problems[0]
+    assert "run unasked from 0.70" in outcome.attempts[0].problems[0]
     assert cascade.status.escalated == 1
 
 
 async def test_an_unsure_plan_has_the_reason_why_it_should_wait(build: Build) -> None:
-    """Below the confirmation threshold, which failures raise; 0 turns it off."""
+    """Below `llm.run_confidence`, which failures raise for a tier, a plan is shown and does not run."""
     cascade = build(FakeTier(Tier.LOCAL, sure(going(), 0.45)), cache=0)
     plan = (await cascade.plan(ASK)).plan
     assert plan.provenance is not None
-    assert plan.provenance.confirm == ("confidence 0.45 below confirm threshold 0.50",)
-    off = build(FakeTier(Tier.LOCAL, sure(going(), 0.45)), safety=SafetyConfig(confirm_below=0.0))
-    plan = (await off.plan(ASK)).plan
+    assert plan.provenance.confirm == ("the planner is 0.45 sure, and plans run unasked from 0.60",)
+    low = build(FakeTier(Tier.LOCAL, sure(going(), 0.45)), cache=0, run_confidence=0.4)
+    plan = (await low.plan(ASK)).plan
     assert plan.provenance is not None
     assert plan.provenance.confirm == ()
 
@@ -157,7 +157,7 @@ async def test_the_policy_holds_for_every_tier_and_for_plans_handed_in(build: Bu
     cascade = build(FakeTier(Tier.LOCAL, sure(going()), sure(going())), safety=safety)
     with pytest.raises(PlanError, match="places_never"):
         await cascade.plan(ASK)
-    assert any("places_never" in each for each in cascade.check(going(), PlanContext(instruction="")))
+    assert any("places_never" in each for each in cascade.review(going(), PlanContext(instruction="")).problems)
 
 
 async def test_an_invention_is_refused(build: Build) -> None:
@@ -242,14 +242,14 @@ async def test_peers_are_asked_in_turn_and_left_alone_when_they_fail() -> None:
         asked.append(gateway)
         if gateway == "a":
             raise UnreachableError("gone")
-        return Proposed(plan=going(), confidence=0.9, doubtful=True, model="m")
+        return Proposed(plan=going(), confidence=0.9, model="m")
 
     statuses = {"a": having("a"), "b": having("b", load=0.9)}
     tier = PeerTier(LlmConfig(), gateways=lambda: statuses, ask=ask, here="me")
     assert tier.present
     for _ in range(3):
         proposal = await tier.propose(ASK)
-        assert (proposal.gateway, proposal.model, proposal.doubtful) == ("b", "m", True)
+        assert (proposal.gateway, proposal.model) == ("b", "m")
     assert asked == ["a", "b", "a", "b", "b"]
     statuses.pop("b")
     with pytest.raises(UnreachableError, match="no other gateway's model answered"):
@@ -270,9 +270,9 @@ async def test_a_peer_is_asked_only_when_the_own_model_said_nothing(build: Build
 
 async def test_what_a_gateway_answers_to_others(build: Build) -> None:
     """The local model's proposal unchecked, the refusal of what is no instruction, or that there is no model."""
-    cascade = build(FakeTier(Tier.LOCAL, replace(sure(going(), 0.3), model="m", doubtful=True)))
+    cascade = build(FakeTier(Tier.LOCAL, replace(sure(going(), 0.3), model="m")))
     answer = await cascade.propose(ProposeAsk(instruction="go to dock 1"))
-    assert (answer.confidence, answer.model, answer.doubtful) == (0.3, "m", True)
+    assert (answer.confidence, answer.model) == (0.3, "m")
     with pytest.raises(PlanError, match="empty"):
         await cascade.propose(ProposeAsk(instruction=" "))
     with pytest.raises(ConfigError, match="gw-1 has no local model"):

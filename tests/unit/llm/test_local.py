@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError
 from appliance.llm.local import LocalTier
+from appliance.llm.review import Facts, review
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
@@ -58,11 +59,16 @@ class Model:
         }
 
 
-async def proposed(model: Model, context: PlanContext = CONTEXT, *, least: float = 0.6) -> Proposal:
-    """Return what the tier proposes where it must be so sure at least."""
-    tier = LocalTier(LlmConfig(local_model=Model.folder, local_min_confidence=least), CATALOGUE)
+async def proposed(model: Model, context: PlanContext = CONTEXT) -> Proposal:
+    """Return what the tier proposes."""
+    tier = LocalTier(LlmConfig(local_model=Model.folder), CATALOGUE)
     tier._process = model  # pyright: ignore[reportAttributeAccessIssue]
     return await tier.propose(context)
+
+
+def held(proposal: Proposal, context: PlanContext) -> tuple[str, ...]:
+    """Return why the review holds a proposal."""
+    return review(Facts(proposal.plan, context, CATALOGUE, SafetyConfig())).holds
 
 
 async def asked(*answers: tuple[list[str], float]) -> tuple[dict[str, object], float]:
@@ -78,8 +84,8 @@ async def test_the_likeliest_answer_that_breaks_no_rule_is_taken() -> None:
 
 
 async def test_when_all_break_a_rule_the_likeliest_is_told() -> None:
-    """Its problems are what repair and refusal go by; nobody is sure of it, whatever the model says."""
-    assert await asked((NOWHERE, 0.8), (UNREADABLE, 0.1), (NOWHERE, 0.05)) == ({}, pytest.approx(0.48))
+    """Its problems are what repair and refusal go by; the review refuses or holds it, whatever the model says."""
+    assert await asked((NOWHERE, 0.8), (UNREADABLE, 0.1), (NOWHERE, 0.05)) == ({}, pytest.approx(0.8))
 
 
 async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
@@ -94,7 +100,7 @@ async def test_when_all_break_a_rule_others_are_looked_for_once() -> None:
 
 
 async def test_of_a_doubtful_plan_others_are_looked_for_and_why_is_told() -> None:
-    """One without doubts is taken unless it is far less likely; a doubtful one is sure of nothing, and says why."""
+    """One without doubts is taken unless it is far less likely; a doubtful one is held, with the reason."""
     two = PlanContext(
         instruction="rover_1 goes to dock 3 while rover_2 does", robots=(ROVER, replace(ROVER, id="rover_2"))
     )
@@ -106,8 +112,7 @@ async def test_of_a_doubtful_plan_others_are_looked_for_and_why_is_told() -> Non
         proposal = await proposed(model, two)
         assert model.asked == [False, True]
         assert [each.robot for each in proposal.plan.subtasks] == ["rover_1"]
-        assert proposal.confidence < LlmConfig().local_min_confidence
-        assert "rover_2 is named and has nothing to do" in proposal.problems
+        assert "rover_2 is named and has nothing to do" in held(proposal, two)
 
 
 async def test_of_plans_that_robots_cannot_do_the_one_that_is_meant_is_told() -> None:
@@ -124,15 +129,6 @@ async def test_the_plan_there_is_outlives_a_second_look_that_fails() -> None:
         model = Model([(NOWHERE, 0.8)], thorough=thorough)
         assert (await proposed(model)).plan.subtasks[0].params == {}
         assert model.asked == [False, True]
-
-
-async def test_no_threshold_lets_a_plan_through_that_breaks_a_rule() -> None:
-    """However low a site sets `llm.local_min_confidence`, it is called doubtful and is less than half sure."""
-    for least in (0.6, 0.2, 0.0):
-        proposal = await proposed(Model([(NOWHERE, 0.8)]), least=least)
-        assert proposal.doubtful
-        assert 0.0 < proposal.confidence < SafetyConfig().confirm_below
-        assert not (await proposed(Model([(RIGHT, 0.01)]), least=least)).doubtful
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ def test_they_say_so_in_their_manifests() -> None:
     for name in LONG:
         manifest = load_catalogue().skills[name]
         assert manifest.checkpoints
-        assert manifest.moves == "between commands"
+        assert manifest.migratable == "between commands"
         assert "ctx.checkpoint(" in (SKILLS / name / "handler.py").read_text()
 
 

@@ -33,6 +33,7 @@ from appliance.model import (
     TaskState,
     encode,
 )  # fmt: skip
+from appliance.llm.review import Review
 from appliance.model.tasks import LostRun
 from appliance.plane.dht import Record
 from appliance.pool.api import Hinted
@@ -67,10 +68,10 @@ class AgreeableDecomposer:
     def __init__(self) -> None:
         self.memory = SimpleNamespace(experience=Experience(lambda: 0.0))
 
-    def check(self, plan: Plan, context: PlanContext) -> tuple[str, ...]:
+    def review(self, plan: Plan, context: PlanContext) -> Review:
         """Find nothing."""
         del plan, context
-        return ()
+        return Review()
 
 
 @pytest.fixture

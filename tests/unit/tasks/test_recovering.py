@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import PlanError
-from appliance.model import Failure, Plan, RunEvent, RunEventKind, Subtask, SubtaskState, TaskState
+from appliance.model import Failure, Plan, Provenance, RunEvent, RunEventKind, Subtask, SubtaskState, TaskState, Tier
 from appliance.tasks.api import RunStatus
 from appliance.tasks.replan.settings import ReplanConfig
 from appliance.tasks.steering.api import ApproveAsk, RejectAsk
@@ -26,6 +26,12 @@ BESIDE = Subtask(id="s3", skill="work", params={"n": 3})
 def new_plan(*subtasks: Subtask, confidence: float = 0.9) -> Plan:
     """What the decomposer answers."""
     return Plan(domain="any", subtasks=subtasks, confidence=confidence)
+
+
+def unsure(plan: Plan) -> Plan:
+    """Return a plan that the review holds: the decomposer is not sure enough of it."""
+    found = Provenance(tier=Tier.RULES, confidence=0.4, confirm=("the planner is 0.40 sure",))
+    return replace(plan, confidence=0.4, provenance=found)
 
 
 OTHERWISE = new_plan(replace(WORK, id="a"), Subtask(id="b", skill="work", params={"n": 9}, after=("a",)))
@@ -86,7 +92,7 @@ async def test_a_decomposer_that_breaks_or_hangs_ends_the_task_with_the_first_fa
 
 async def test_an_unsure_plan_waits_for_an_operator(bench: Any) -> None:
     """Below the threshold it is proposed and nothing is sent; with an operator's word it takes effect."""
-    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(OTHERWISE)
     await first_done_second_broken(bench)
     record = await bench.until(lambda record: record.proposal is not None)
     assert record.proposal.waits
@@ -122,7 +128,7 @@ async def test_the_approval_rule_counts_for_a_new_plan(bench: Any) -> None:
 
 async def test_an_operator_turns_a_plan_down(bench: Any) -> None:
     """The task fails with the first failure, and says who did not agree."""
-    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(OTHERWISE)
     await first_done_second_broken(bench)
     await bench.until(lambda record: record.proposal is not None)
     await bench.order(RejectAsk(id="t-1", by="ann"))
@@ -133,7 +139,7 @@ async def test_an_operator_turns_a_plan_down(bench: Any) -> None:
 async def test_a_proposal_that_nobody_answers_ends(bench: Any) -> None:
     """The wait for an operator is bounded."""
     bench.around.config = replace(bench.around.config, replan=ReplanConfig(confirm_s=0.05))
-    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(OTHERWISE)
     await first_done_second_broken(bench)
     ended = await bench.end()
     assert "no operator agreed" in ended.failure.message
@@ -143,14 +149,14 @@ async def test_each_proposal_has_the_whole_time_to_be_answered(bench: Any) -> No
     """A second one, later than the first one's time, waits for an operator as well."""
     bench.plane.rpc.on["run_status"] = running
     bench.around.config = replace(bench.around.config, replan=ReplanConfig(confirm_s=2.0))
-    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(OTHERWISE)
     await first_done_second_broken(bench)
     await bench.until(lambda record: record.proposal is not None)
     await bench.order(ApproveAsk(id="t-1", by="ann"))
     _, request = await bench.ordered()
     bench.tell(request, STARTED)
     await asyncio.sleep(2.1)
-    bench.around.recovery.new_plan = replace(ONCE_MORE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(ONCE_MORE)
     bench.tell(request, FAILED, failure=BROKEN)
     await bench.until(lambda record: record.proposal is not None or record.state.final)
     await bench.order(ApproveAsk(id="t-1", by="ann"))
@@ -161,7 +167,7 @@ async def test_each_proposal_has_the_whole_time_to_be_answered(bench: Any) -> No
 
 async def test_a_takeover_does_not_prolong_the_wait_for_an_operator(bench: Any) -> None:
     """The next coordinator counts from when the plan was proposed, by the task's own age."""
-    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(OTHERWISE)
     await first_done_second_broken(bench)
     await bench.until(lambda record: record.proposal is not None)
     async with asyncio.timeout(60):
@@ -237,7 +243,7 @@ async def test_what_finishes_while_it_is_to_be_ended_stays_finished(bench: Any) 
 
 async def test_a_coordinator_that_takes_over_does_not_ask_again(bench: Any) -> None:
     """The proposal is in the record: the next driver has it take effect."""
-    bench.around.recovery.new_plan = replace(OTHERWISE, confidence=0.4)
+    bench.around.recovery.new_plan = unsure(OTHERWISE)
     await first_done_second_broken(bench)
     await bench.until(lambda record: record.proposal is not None)
     async with asyncio.timeout(60):

@@ -1,7 +1,7 @@
 """What cannot be meant by an instruction, though it is a plan."""
 
-from appliance.llm.corpus.notation import parse
 from appliance.llm.checks.consistency import Meaning, problems
+from appliance.llm.corpus.notation import parse
 from appliance.skills.catalogue import load_catalogue
 
 CATALOGUE = load_catalogue()

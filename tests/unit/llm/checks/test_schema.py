@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.llm.checks.schema import MAX_PROBLEMS, MAX_SUBTASKS, locate, validate
+from appliance.llm.checks.places import locate
+from appliance.llm.checks.schema import MAX_PROBLEMS, MAX_SUBTASKS, validate
 from appliance.model import Plan, RobotInfo, Site, Subtask
 from appliance.skills.catalogue import Catalogue, load_catalogue
 

@@ -93,7 +93,7 @@ def memory(clock: Clock | None = None) -> Memory:
     """Return a memory of nothing."""
     clock = clock or Clock()
     return Memory(
-        thresholds=Thresholds({"local": 0.6}, confirm_below=0.5, clock=clock),
+        thresholds=Thresholds({"local": 0.6}, clock=clock),
         budget=Budget(cost=0, requests=0, price_in=0, price_out=0),
         most_plans=8,
         clock=clock,

@@ -172,40 +172,37 @@ def test_a_pattern_that_is_none_is_named() -> None:
 def test_a_threshold_rises_over_plans_that_fail_and_comes_back() -> None:
     """Plans that were sure enough and failed raise it above them; good ones and time bring it back, never below."""
     clock = Clock()
-    thresholds = Thresholds({"local": 0.6, "rules": 0.8}, confirm_below=0.5, clock=clock)
+    thresholds = Thresholds({"local": 0.6, "rules": 0.8}, clock=clock)
     assert thresholds.of("local") == 0.6
     for _ in range(4):
         thresholds.add("local", 0.68, good=False)
     assert 0.68 < thresholds.of("local") < 0.8
     assert thresholds.of("rules") == 0.8
-    assert thresholds.confirm_below > 0.68
     for _ in range(30):
         thresholds.add("local", 0.7, good=True)
     assert thresholds.of("local") == 0.6
     clock.now += 20 * HALF_LIFE_S
     assert thresholds.all == {"local": 0.6, "rules": 0.8}
-    assert thresholds.confirm_below == 0.5
 
 
 def test_one_failure_is_chance() -> None:
-    """Too few outcomes conclude nothing, and a confirmation that is off stays off."""
-    thresholds = Thresholds({"local": 0.6}, confirm_below=0.0, clock=Clock())
+    """Too few outcomes conclude nothing."""
+    thresholds = Thresholds({"local": 0.6}, clock=Clock())
     thresholds.add("local", 0.9, good=False)
     assert thresholds.of("local") == 0.6
     for _ in range(20):
         thresholds.add("local", 0.9, good=False)
     assert thresholds.of("local") == 0.95
-    assert thresholds.confirm_below == 0.0
 
 
 @given(st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=100), st.floats(0, 1))
 def test_experience_only_tightens(outcomes: list[tuple[float, bool]], base: float) -> None:
     """No history takes a threshold below what is configured, or above one; what is kept gives the same again."""
     clock = Clock()
-    thresholds = Thresholds({"t": base}, confirm_below=base, clock=clock)
+    thresholds = Thresholds({"t": base}, clock=clock)
     for sure, good in outcomes:
         thresholds.add("t", sure, good=good)
     assert base - 1e-4 <= thresholds.of("t") <= max(base, 0.95)
-    other = Thresholds({"t": base}, confirm_below=base, clock=clock)
+    other = Thresholds({"t": base}, clock=clock)
     other.load(thresholds.rows())
     assert other.all == thresholds.all

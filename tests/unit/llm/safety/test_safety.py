@@ -9,15 +9,15 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import ConfigError
-from appliance.llm.checks.policy import unsafe
-from appliance.llm.safety.confirming import reasons_to_confirm
 from appliance.llm.checks.contradiction import contradictions
+from appliance.llm.checks.finding import Facts
 from appliance.llm.checks.grounding import ungrounded
+from appliance.llm.checks.policy import policy_holds, unsafe
+from appliance.llm.checks.schema import validate
 from appliance.llm.safety.quoting import MOST, quoted
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.llm.settings import PlanContext
-from appliance.llm.checks.schema import validate
-from appliance.model import Place, Plan, Pose, RobotInfo, Site, Subtask
+from appliance.model import Place, Plan, Pose, RobotInfo, Severity, Site, Subtask
 from appliance.skills.catalogue import Catalogue
 
 
@@ -339,14 +339,14 @@ def test_names_of_one_place_ground_each_other(site: Site, robots: tuple[RobotInf
     assert ungrounded(plan(step("s1", "goto", place="goal 2")), asked) == ()
 
 
-def test_why_an_operator_should_look_first() -> None:
-    """Below the threshold, or with a skill that is named, there is a reason; otherwise none."""
+def test_why_an_operator_should_look_first(catalogue: Catalogue) -> None:
+    """A skill that the policy names holds a plan, whoever wrote it; otherwise nothing does."""
     cut = plan(step("s1", "cut", object="rope"))
+    asked = PlanContext(instruction="cut the rope")
     config = SafetyConfig(confirm_skills=("cu*",))
-    assert reasons_to_confirm(cut, SafetyConfig(), confidence=0.9, confirm_below=0.5) == ()
-    low, skill = reasons_to_confirm(cut, config, confidence=0.45, confirm_below=0.5)
-    assert low == "confidence 0.45 below confirm threshold 0.50"
-    assert "cut has to be agreed to" in skill
+    assert list(policy_holds(Facts(cut, asked, catalogue, SafetyConfig()))) == []
+    (found,) = policy_holds(Facts(cut, asked, catalogue, config, edited=True))
+    assert (found.severity, found.message) == (Severity.HOLD, "cut needs approval (safety.confirm_skills)")
 
 
 @given(st.text(max_size=400))

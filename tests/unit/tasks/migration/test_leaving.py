@@ -115,7 +115,7 @@ async def test_a_hold_ends_by_itself() -> None:
 async def test_a_run_that_moves_between_commands_is_held_after_the_one_it_is_in() -> None:
     """Or refused, if that takes too long, and then it goes on as before."""
     runs, robot = Runs(), Robot()
-    skill = manifest(runs="robot", verbs=("goto",), moves="between commands")
+    skill = manifest(runs="robot", verbs=("goto",), migratable="between commands")
     it = leaving(runs, skill)
     command = asyncio.create_task(it.guard(COMMAND, robot))
     await asyncio.sleep(0)

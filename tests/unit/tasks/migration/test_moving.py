@@ -278,7 +278,7 @@ async def test_a_run_that_commands_a_robot_stays_unless_its_manifest_says_otherw
     with pytest.raises(RefusedError, match="commands a robot"):
         await fleet.moving.migrate(ASK)
     assert not [verb for verb, _ in fleet.asked if verb != "run_status"]  # the driver itself may have asked that
-    fleet.bench.around.skills["work"] = replace(work, runs="robot", verbs=("goto",), moves="between commands")
+    fleet.bench.around.skills["work"] = replace(work, runs="robot", verbs=("goto",), migratable="between commands")
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
     await start_there(fleet)
     assert isinstance(await moving, Migrated)

@@ -1,0 +1,429 @@
+"""Which words of an instruction a plan accounts for, and which words account for each subtask. Pure.
+
+A plan is aligned with the tokens of its instruction: values of parameters with the words that say them, numbers with
+their units, skills with the phrases of their manifests, robots with their mentions. What is left over is what the plan
+does not do; a subtask without words is what nobody asked for. The alignment uses no model and no planner's output but
+the plan itself.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
+
+from msgspec import Struct
+
+from appliance.llm.checks import lexicon as lx
+from appliance.llm.checks.reading import Reading, Token, stem
+from appliance.llm.language.values import FREE, figures, quantity, unit_of
+from appliance.model import Plan, Site, Subtask
+from appliance.skills.catalogue import Catalogue, SkillManifest
+
+ARTICLES = frozenset(
+    ("the", "a", "an", "my", "our", "your", "its", "his", "her", "their", "some", "of", "that", "this")
+)
+_GAP = 5
+"""Tokens that may stand between a verb and its particle: "pick the big red box up"."""
+_PARTICLES = frozenset(
+    ("up", "down", "on", "off", "out", "back", "away", "over", "in", "together", "around", "for", "to", "at")
+)
+_IRREGULAR = {
+    "go": ("goes", "going", "gone"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
+    "put": ("puts", "putting"), "bring": ("brings", "bringing", "brought"), "drive": ("drives", "driving", "driven"),
+    "get": ("gets", "getting"), "give": ("gives", "giving", "given"), "shoot": ("shoots", "shooting"),
+    "say": ("says", "saying", "said"), "tell": ("tells", "telling"), "find": ("finds", "finding", "found"),
+    "hold": ("holds", "holding", "held"), "leave": ("leaves", "leaving", "left"), "set": ("sets", "setting"),
+    "shut": ("shuts", "shutting"), "come": ("comes", "coming"), "run": ("runs", "running"), "be": ("is", "are", "being"),
+    "read": ("reads", "reading"), "send": ("sends", "sending", "sent"), "make": ("makes", "making"),
+    "keep": ("keeps", "keeping"), "wait": ("waits", "waiting"), "let": ("lets", "letting"), "lift": ("lifts", "lifting"),
+}  # fmt: skip
+_PARAM_WORDS = {
+    "laps": ("lap", "laps", "times", "round", "rounds", "circuit", "circuits", "loop", "loops"),
+    "count": ("times", "shots", "pictures", "photos"),
+    "altitude_m": ("altitude", "height", "high", "up", "above", "ground", "to", "climb", "rise"),
+    "radius_m": ("radius", "distance", "away", "diameter"),
+    "speed_mps": ("speed", "velocity", "at"),
+    "duration_s": ("for", "during", "lasting", "long"),
+    "timeout_s": ("for", "within", "at", "most", "maximum", "up", "to", "limit", "timeout", "than", "longer", "no"),
+    "fps": ("fps", "frames", "per", "second", "rate"),
+    "window_ms": ("window",),
+    "epochs": ("epoch", "epochs"),
+    "place": ("coordinates", "coordinate", "position", "point", "x", "y", "z", "location", "spot", "metres", "meters", "m"),
+    "path": ("path", "route", "along", "via", "through"),
+}  # fmt: skip
+"""Words that come with a parameter and say nothing else."""
+_BLANK = frozenset((",", "-", "–", "(", ")", "and", ":", "="))
+
+
+class Claim(Struct, frozen=True):
+    """A phrase of the instruction that asks for skills."""
+
+    at: tuple[int, ...]
+    """Indices of its tokens."""
+    text: str
+    skills: frozenset[str]
+
+
+class Account(Struct, kw_only=True):
+    """The alignment of a plan with its instruction."""
+
+    covered: set[int]
+    """Indices of tokens that the plan accounts for."""
+    evidence: dict[str, set[int]]
+    """Subtask -> indices of the tokens that ask for it: its phrase, its values, its numbers."""
+    called: dict[str, set[int]]
+    """Subtask -> indices of tokens of phrases that call for its skill."""
+    values: dict[str, set[int]]
+    """Subtask -> indices of tokens that say its values."""
+    unsaid: list[tuple[str, str, str]]
+    """Values that no words say: subtask, parameter, value."""
+    unclaimed: list[Claim]
+    """Phrases that ask for skills the plan does not have."""
+
+
+def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | None) -> Account:
+    """Align a plan with its instruction."""
+    found = Account(
+        covered={number for number, each in enumerate(reading.tokens) if each.kind == "robot"},
+        evidence={each.id: set() for each in plan.subtasks},
+        called={each.id: set() for each in plan.subtasks},
+        values={each.id: set() for each in plan.subtasks},
+        unsaid=[],
+        unclaimed=[],
+    )
+    for subtask in plan.subtasks:
+        for name, value in subtask.params.items():
+            if name == "robots":
+                continue
+            said = _said(reading, name, value, site)
+            if said:
+                found.values[subtask.id] |= said
+                found.covered |= said
+            elif said is None:
+                found.unsaid.append((subtask.id, name, str(value)))
+    _phrases(reading, plan, catalogue, found)
+    for subtask in plan.subtasks:
+        found.evidence[subtask.id] = found.called[subtask.id] | found.values[subtask.id]
+    for subtask in plan.subtasks:
+        _param_words(reading, subtask, found)
+    return found
+
+
+# --- values --------------------------------------------------------------------------------------------------------
+
+
+def _said(reading: Reading, name: str, value: object, site: Site | None) -> set[int] | None:
+    """The tokens that say a value; None when none do, empty when it needs none."""
+    if isinstance(value, bool) or value is None:
+        return set()
+    if isinstance(value, int | float):
+        unit = unit_of(name)
+        return _kept(reading, ("number", repr(value), unit), lambda: number_said(reading, value, unit))
+    if isinstance(value, list | tuple):
+        found: set[int] = set()
+        for each in value:  # pyright: ignore[reportUnknownVariableType]
+            said = _text(reading, str(each), site)  # pyright: ignore[reportUnknownArgumentType]
+            if said is None:
+                return None
+            found |= said
+        return found
+    text = str(value)
+    if name in FREE:
+        return _kept(reading, ("free", text, ""), lambda: free_said(reading, text))
+    return _text(reading, text, site)
+
+
+def _text(reading: Reading, text: str, site: Site | None) -> set[int] | None:
+    return _kept(reading, ("text", text, str(id(site))), lambda: text_said(reading, text, site))
+
+
+def _kept(reading: Reading, key: tuple[str, str, str], find: Callable[[], set[int] | None]) -> set[int] | None:
+    """What was found before for another plan of the same words, else what is found now."""
+    if key not in reading.memo:
+        found = find()
+        reading.memo[key] = None if found is None else frozenset(found)
+    kept = reading.memo[key]
+    return None if kept is None else set(kept)
+
+
+def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
+    """Return the tokens of a quantity with its unit, all of its mentions; None when it is not said."""
+    tokens = reading.tokens
+    found: set[int] = set()
+    at = 0
+    while at < len(tokens):
+        best = 0
+        if _starts_quantity(tokens[at]):
+            for length in range(1, 8):
+                window = tokens[at : at + length]
+                if len(window) < length or any(
+                    each.kind in ("quote", "robot") or each.text in _ENDS for each in window
+                ):
+                    break
+                if not _ends_quantity(window[-1]):
+                    continue
+                said = quantity(reading.text[window[0].start : window[-1].end], unit)
+                if said is not None and abs(float(said) - value) <= 1e-3 * max(1.0, abs(value)):
+                    best = length
+        if best:
+            found.update(range(at, at + best))
+        at += max(1, best)
+    return found or None
+
+
+_ENDS = frozenset((";", "?", "!", "\n", ","))
+
+
+def _ends_quantity(token: Token) -> bool:
+    return _starts_quantity(token) or token.text in lx.UNITS or token.text in ("times", "time", "quarters", "dozen")
+
+
+def _starts_quantity(token: Token) -> bool:
+    return token.value is not None or token.text in (
+        "a", "an", "half", "quarter", "once", "twice", "thrice", "single", "couple", "pair", "both", "three", "hundred",
+        "another", "½", "¼", "¾",
+    )  # fmt: skip
+
+
+def free_said(reading: Reading, text: str) -> set[int] | None:
+    """Return the tokens of a free text: a quotation, or a run of words as it stands."""
+    wanted = re.findall(r"\w+", text.casefold())
+    if not wanted:
+        return set()
+    for number, token in enumerate(reading.tokens):
+        if token.kind == "quote" and re.findall(r"\w+", token.text) == wanted:
+            return {number}
+    flat: list[tuple[str, int]] = [
+        (word, number) for number, token in enumerate(reading.tokens) for word in re.findall(r"\w+", token.text)
+    ]
+    text_words = [word for word, _ in flat]
+    for start in range(len(flat) - len(wanted) + 1):
+        if all(_same(one, two) for one, two in zip(text_words[start : start + len(wanted)], wanted, strict=True)):
+            return {number for _, number in flat[start : start + len(wanted)]}
+    return None
+
+
+def text_said(reading: Reading, text: str, site: Site | None = None) -> set[int] | None:
+    """Return the tokens that say a name or coordinate, all of its mentions; None when they do not."""
+    names = [text]
+    place = site.find(text) if site is not None else None
+    if site is not None and place is not None:
+        names += [key for key, each in site.places.items() if each is place]
+        names += place.aliases
+    found: set[int] = set()
+    for name in dict.fromkeys(names):
+        found |= _spans(reading, _words(name))
+    if found:
+        return found
+    return _scattered(reading, _words(text))
+
+
+def _words(text: str) -> list[str]:
+    return [
+        each.removesuffix("'s")
+        for each in re.findall(r"[-−]?\d+(?:[.,]\d+)*|[^\W\d_]+(?:'[^\W\d_]+)*", figures(text.casefold()))
+        if each not in ARTICLES or len(text.split()) == 1
+    ]
+
+
+def _same(said: str, wanted: str) -> bool:
+    if said == wanted or stem(said) == stem(wanted):
+        return True
+    return said.removesuffix("'s") == wanted
+
+
+def _equal(token: Token, wanted: str) -> bool:
+    if token.kind in ("number", "word") and token.value is not None and wanted[-1].isdigit():
+        try:
+            return token.value == float(wanted.replace(",", "").replace("−", "-"))
+        except ValueError:
+            return False
+    if token.kind == "robot":
+        return wanted in re.findall(r"[^\W\d_]+|\d+", token.text)
+    return _same(token.text, wanted)
+
+
+def _spans(reading: Reading, wanted: Sequence[str]) -> set[int]:
+    """All runs of tokens that say these words in this order, articles and joining marks between them passed over."""
+    tokens = reading.tokens
+    found: set[int] = set()
+    if not wanted:
+        return found
+    for start in range(len(tokens)):
+        index, run = start, list[int]()
+        for number, word in enumerate(wanted):
+            while (
+                number
+                and index < len(tokens)
+                and (
+                    tokens[index].text in ARTICLES
+                    or tokens[index].text in _BLANK
+                    or tokens[index].text in ("_", "/", ".")
+                )
+                and not _equal(tokens[index], word)
+            ):
+                run.append(index)
+                index += 1
+            if index >= len(tokens) or not _equal(tokens[index], word):
+                run = []
+                break
+            run.append(index)
+            index += 1
+        found.update(run)
+    return found
+
+
+def _scattered(reading: Reading, wanted: Sequence[str]) -> set[int] | None:
+    """Tokens that say each of these words somewhere ("stations 3, 5 and 8", "the box that is red")."""
+    found: set[int] = set()
+    for word in wanted:
+        at = {number for number, token in enumerate(reading.tokens) if token.kind != "quote" and _equal(token, word)}
+        if not at:
+            return None
+        found |= at
+    return found or None
+
+
+# --- skills --------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=4096)
+def forms(verb: str) -> frozenset[str]:
+    """Return a verb's forms as orders use them: "photograph", "photographs", "photographing", "photographed"."""
+    found = {verb, *_IRREGULAR.get(verb, ())}
+    if verb in _IRREGULAR:
+        return frozenset(found)
+    found.add(f"{verb}s")
+    if verb.endswith(("s", "x", "z", "ch", "sh", "o")):
+        found.add(f"{verb}es")
+    if len(verb) > 2 and verb.endswith("y") and verb[-2] not in "aeiou":
+        found |= {f"{verb[:-1]}ies", f"{verb[:-1]}ied"}
+    if verb.endswith("e"):
+        found |= {f"{verb[:-1]}ing", f"{verb}d"}
+    else:
+        found |= {f"{verb}ing", f"{verb}ed"}
+        if len(verb) > 2 and verb[-1] not in "aeiouwxy" and verb[-2] in "aeiou":
+            found |= {f"{verb}{verb[-1]}ing", f"{verb}{verb[-1]}ed"}
+    return frozenset(found)
+
+
+def phrase_table(catalogue: Catalogue) -> Mapping[str, tuple[tuple[tuple[str, ...], frozenset[str]], ...]]:
+    """Return first word in any form -> phrases (words, skills), longest first, of all manifests of a catalogue."""
+    key = id(catalogue.skills)
+    kept = _TABLES.get(key)
+    if kept is not None and kept[0] is catalogue.skills:
+        return kept[1]
+    skills: dict[tuple[str, ...], set[str]] = {}
+    for manifest in catalogue.skills.values():
+        for phrase in manifest.phrases:
+            skills.setdefault(tuple(phrase.split()), set()).add(manifest.id)
+    table: dict[str, list[tuple[tuple[str, ...], frozenset[str]]]] = {}
+    for words, asked in sorted(skills.items(), key=lambda pair: -len(pair[0])):
+        for form in forms(words[0]):
+            table.setdefault(form, []).append((words, frozenset(asked)))
+    made = {form: tuple(each) for form, each in table.items()}
+    _TABLES[key] = (catalogue.skills, made)
+    while len(_TABLES) > 8:
+        _TABLES.pop(next(iter(_TABLES)))
+    return made
+
+
+_TABLES: dict[
+    int, tuple[dict[str, SkillManifest], Mapping[str, tuple[tuple[tuple[str, ...], frozenset[str]], ...]]]
+] = {}
+
+
+def claims(reading: Reading, catalogue: Catalogue, *, taken: Iterable[int] = ()) -> list[list[Claim]]:
+    """Return for each token that may begin a phrase its phrases, the likeliest first; `taken` are no verbs."""
+    table = phrase_table(catalogue)
+    tokens = reading.tokens
+    kept = set(taken)
+    found: list[list[Claim]] = []
+    for start, token in enumerate(tokens):
+        if token.kind != "word" or start in kept:
+            continue
+        options: list[Claim] = []
+        for words, skills in table.get(token.text, ()):
+            at = _phrase_at(reading, start, words, kept)
+            if at:
+                options.append(Claim(at, " ".join(tokens[index].text for index in at), skills))
+        if options:
+            found.append(options)
+    return found
+
+
+def _phrase_at(reading: Reading, start: int, words: Sequence[str], taken: set[int]) -> tuple[int, ...]:
+    """The tokens of a phrase that begins at `start`; a last particle may stand behind its object."""
+    tokens = reading.tokens
+    at = [start]
+    index = start + 1
+    for word in words[1:]:
+        while index < len(tokens) and tokens[index].text in ARTICLES and tokens[index].text != word:
+            index += 1
+        if index < len(tokens) and (tokens[index].text == word or stem(tokens[index].text) == stem(word)):
+            at.append(index)
+            index += 1
+            continue
+        if word in _PARTICLES and word == words[-1]:
+            for further in range(index, min(len(tokens), index + _GAP)):
+                each = tokens[further]
+                if (
+                    each.kind == "mark"
+                    or reading.sentence[further] != reading.sentence[start]
+                    or each.text in ("and", "then")
+                ):
+                    break
+                if each.text == word and further not in taken:
+                    return (*at, further)
+        return ()
+    return tuple(at)
+
+
+def _phrases(reading: Reading, plan: Plan, catalogue: Catalogue, found: Account) -> None:
+    planned = {each.skill for each in plan.subtasks}
+    # Words that say a value are no verbs: "dock 1" asks for no docking. But a value that is also the only verb is one:
+    # "photograph the photograph" is rare, "dock at the dock" is not, so only whole values are left out.
+    inside = set[int]().union(*found.values.values()) if found.values else set[int]()
+    used: set[int] = set()
+    pending: list[list[Claim]] = []
+    for options in claims(reading, catalogue, taken=inside):
+        if options[0].at[0] in used:
+            continue
+        longest = (
+            max(len(each.at) for each in options if each.at[-1] - each.at[0] < len(each.at))
+            if any(each.at[-1] - each.at[0] < len(each.at) for each in options)
+            else 0
+        )
+        fitting = [
+            each
+            for each in options
+            if each.skills & planned and (len(each.at) >= longest or each.at[-1] - each.at[0] >= len(each.at))
+        ]
+        if fitting:
+            best = max(fitting, key=lambda each: len(each.at))
+            skills = frozenset[str]().union(*(each.skills for each in fitting))
+            for subtask in plan.subtasks:
+                if subtask.skill in skills:
+                    found.called[subtask.id] |= set(best.at)
+            found.covered |= set(best.at)
+            used |= set(best.at)
+        else:
+            pending.append(options)
+    for options in pending:
+        lost = {index for each in found.unclaimed for index in each.at}
+        left = [each for each in options if not set(each.at) & (found.covered | lost)]
+        if left:
+            found.unclaimed.append(max(left, key=lambda each: len(each.at)))
+
+
+def _param_words(reading: Reading, subtask: Subtask, found: Account) -> None:
+    """Cover the words that come with a parameter next to its value: "for", "laps", "at a height of"."""
+    said = found.values[subtask.id]
+    for name in subtask.params:
+        words = _PARAM_WORDS.get(name, ())
+        for number, token in enumerate(reading.tokens):
+            if token.text in words and number not in found.covered and _near(number, said, reading):
+                found.covered.add(number)
+
+
+def _near(index: int, said: set[int], reading: Reading) -> bool:
+    return any(abs(each - index) <= 4 and reading.sentence[each] == reading.sentence[index] for each in said)

@@ -1,0 +1,97 @@
+"""Words of English that checks know: small words, and words that change what an order means.
+
+Skills' own words are not here: they stand in their manifests (`phrases`).
+"""
+
+
+def _set(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+FILLERS = _set(
+    "the a an my our your its his her their some of to at in on into onto from with by near for via through inside "
+    "towards toward until till upon there here then next after afterwards before once when while whilst meanwhile and "
+    "also too plus as so first firstly second secondly third thirdly fourth finally lastly last subsequently please "
+    "kindly pls plz thanks thank hey hi hello ok okay alright right good now immediately straight directly just "
+    "simply both each done finished finnished complete completed ready arrived landed airborne it they he she you we "
+    "i me us them him who which that this these those be been being is are has have had do does did get got let make "
+    "made making tell order command instruct send must shall will should may need needs want like task job mission "
+    "step steps everything following follows during same time parallel simultaneously together respectively way soon "
+    "own one ones itself themselves robot proceed begin begins start starts starting carry perform doing go execute "
+    "sure ahead using use available fetch base gateway site warehouse yard out over along across carefully safely "
+    "another other locally local between among amongst against but every all well copy roger break"
+)
+"""Words that may stand beside a plan without being in it."""
+FILLER_PHRASES = (
+    "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to", "do not hesitate to",
+    "never mind", "i would like", "i'd like", "we would like", "we'd like", "would like you to", "could you",
+    "can you", "would you", "will you", "could somebody", "could someone", "can somebody", "can someone",
+    "would you mind", "would you please", "if you can", "if you please", "if you would", "if you don't mind",
+    "could you have", "can i have", "can we have", "could i have", "could we have", "may i have", "i want",
+    "i need", "we want", "we need", "make sure", "be sure", "in that order", "in this order", "in order",
+    "one after the other", "one by one", "right away", "right now", "straight away", "at once", "as well",
+    "all the way", "when you are done", "when you're done", "once you are done", "once you're done", "that's",
+    "it's", "it has", "they've", "let's", "you've", "you have", "in the meantime", "at the same time", "as soon as",
+    "thank you", "no hurry", "is to", "are to", "has to", "have to", "needs to", "need to", "got to", "go ahead",
+    "go and", "on your way", "from there", "over there", "over here", "by the way", "for me", "for us",
+    "your job is", "one of",
+)  # fmt: skip
+"""Runs of words that may stand beside a plan without being in it, longer ones first where they overlap."""
+NEGATIONS = _set(
+    "not no never none nobody nothing neither nor without avoid avoiding refuse refrain refraining cancel skip omit "
+    "forget don't dont doesn't doesnt didn't shouldn't shouldnt mustn't mustnt can't cant cannot won't wont wouldn't "
+    "isn't aren't n't prohibited forbidden forbid forbids prohibit stop stops cease quit abort halt unnecessary "
+    "disregard ignore ignoring prevent hardly barely"
+)
+"""Words that forbid what follows."""
+EXCEPTIONS = _set(
+    "unless except excepting excluding exclude other-than save bar barring apart instead rather but-not only"
+)
+"""Words that take something out of an order."""
+CONDITIONS = _set(
+    "if provided providing assuming suppose supposing otherwise else whether whenever depending depends case "
+    "condition granted given lest in-case"
+)
+"""Words that make an order depend on the world."""
+STANDING = _set("whenever always forever constantly continuously continually")
+TIMES = _set(
+    "tomorrow tonight today yesterday later noon midnight midday morning afternoon evening night daily hourly nightly "
+    "weekly monthly monday tuesday wednesday thursday friday saturday sunday week month year am pm a.m p.m o'clock "
+    "oclock periodically regularly repeatedly continuously constantly forever always schedule scheduled sunrise "
+    "sunset dawn dusk lunchtime lunch shift weekday weekdays weekend weekends delay delayed minutely again repeat "
+    "repeats eventually sometime whenever continually"
+)
+"""Words of clock times, dates and repeats."""
+ALTERNATIVES = _set(
+    "or either whichever whatever perhaps maybe alternatively possibly preferably might possible probably optionally"
+)
+"""Words that leave open what is meant."""
+CORRECTIONS = _set(
+    "no scratch sorry actually correction rather wait oops wrong instead mean meant strike nope belay undo"
+)
+"""Words that take back what was said before."""
+AGAIN = _set("twice thrice again times each every more both")
+"""Words that ask for a thing more than once."""
+RESULTS = _set(
+    "result results finding findings reading readings picture pictures photo photos photograph photographs image "
+    "images video footage recording recordings scan scans map maps count counts detection detections update updates "
+    "transcript report data clip clips sound audio list round"
+)
+"""Nouns for what earlier steps bring: a later step works on them without naming them in the plan."""
+PRONOUNS = _set("it them they he she him her his its that this these those there here")
+"""Words that stand for something said before."""
+THINGS = _set("it that this them these those")
+NAMELESS = THINGS | _set("me there here something thing stuff somewhere anything")
+"""Words that name no thing or place by themselves."""
+SEQUENCE = _set("then afterwards next finally subsequently lastly thereafter thereupon")
+"""Words between an order and the one that follows it."""
+SIDE_BY_SIDE = _set("while whilst meanwhile simultaneously")
+"""Words between orders that run at the same time."""
+COURTESY = _set("could can would will please kindly may")
+"""First words of a polite order that ends in a question mark."""
+QUESTION_WORDS = _set("what where why when who whose which how is are was were do does did has have should shall am")
+UNITS = _set(
+    "m metre metres meter meters cm km s sec secs second seconds min mins minute minutes h hr hrs hour hours ft foot "
+    "feet mph kmh kph mps knot knots degree degrees deg percent yard yards mile miles inch inches day days ms"
+)
+"""Words behind a figure."""

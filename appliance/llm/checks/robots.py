@@ -1,0 +1,172 @@
+"""Checks of robots: a plan moves those that the words name or imply, and gives each what the words give it. Pure."""
+
+from collections.abc import Iterable
+
+from appliance.llm.checks.finding import Facts, Finding, Severity
+from appliance.llm.checks.policy import robots_of
+from appliance.llm.checks.reading import Token
+from appliance.llm.checks.schema import able, is_unnamed
+
+_NOT_SUBJECT = frozenset(
+    (
+        "to",
+        "follow",
+        "follows",
+        "following",
+        "towards",
+        "toward",
+        "behind",
+        "beside",
+        "near",
+        "from",
+        "at",
+        "meet",
+        "around",
+    )
+)
+"""Words before a robot that is no subject: "give the box to rover_2"."""
+_ELLIPSIS = frozenset(("does", "do", "same", "likewise", "too"))
+"""Words that give another robot what was said before: "rover_1 goes to dock 3 while rover_2 does"."""
+_JOIN = frozenset((",", "and", "&", "plus"))
+_INSTRUMENT = frozenset(("with", "using", "by", "via", "have", "let", "send", "get", "tell", "ask", "make"))
+
+
+def candidates(facts: Facts, name: str) -> list[str]:
+    """Return the robots of the roster that can do all that a plan gives one name."""
+    manifests = [
+        m for each in facts.plan.subtasks if name in robots_of(each) and (m := facts.manifest(each)) is not None
+    ]
+    return sorted(each.id for each in facts.robots or () if not any(able(each, m) for m in manifests))
+
+
+def unnamed_robot(facts: Facts) -> Iterable[Finding]:
+    """A plan moves no robot that the words neither name nor imply."""
+    if facts.robots is None or facts.continued:
+        return
+    reading = facts.reading
+    named = set(reading.named)
+    loose = {robot for each in reading.tokens if each.group == "any" for robot in each.robots}
+    planned = dict.fromkeys(robot for each in facts.plan.subtasks for robot in sorted(robots_of(each)))
+    choice: list[str] = []
+    for robot in planned:
+        if is_unnamed(robot):
+            able_ = candidates(facts, robot)
+            if len(able_) > 1:
+                choice = able_
+            continue
+        if robot in named or robot == "all":
+            continue
+        able_ = candidates(facts, robot)
+        if named and not loose:
+            yield Finding(
+                check="unnamed_robot", severity=Severity.HOLD,
+                message=f"the plan uses {robot}, which the words do not name", hint="name each robot",
+            )  # fmt: skip
+        elif able_ != [robot]:
+            choice = able_
+    if choice and facts.safety.choose_robot == "ask":
+        yield Finding(
+            check="unnamed_robot", severity=Severity.HOLD,
+            message=f"several robots can do this, and none is named: {', '.join(choice[:8])}",
+            hint="name the robot, or set safety.choose_robot = \"auto\"",
+        )  # fmt: skip
+
+
+def idle_robot(facts: Facts) -> Iterable[Finding]:
+    """Each robot that the words name has something to do."""
+    if facts.continued:
+        return
+    busy = {robot for each in facts.plan.subtasks for robot in robots_of(each)}
+    values = set[int]().union(*facts.account.values.values()) if facts.account.values else set[int]()
+    from appliance.llm.checks.wording import forbidden  # noqa: PLC0415 - words ask for robots, too
+
+    skip = values | forbidden(facts)
+    idle = {
+        robot
+        for number, each in enumerate(facts.reading.tokens)
+        if each.kind == "robot" and each.group in ("one", "all") and number not in skip
+        for robot in each.robots
+    } - busy
+    if idle and "all" not in busy and not any(is_unnamed(each) for each in busy):
+        names = ", ".join(sorted(idle))
+        yield Finding(
+            check="idle_robot",
+            severity=Severity.HOLD,
+            message=f"{names} is named and has nothing to do",
+            words=tuple(sorted(idle)),
+        )
+
+
+def assignment(facts: Facts) -> Iterable[Finding]:
+    """Each robot does what the words give to it, not what they give to another."""
+    if facts.continued:
+        return
+    governs = _governors(facts)
+    if not any(governs) or any(each.text in _ELLIPSIS for each in facts.reading.tokens):
+        return
+    for subtask in facts.plan.subtasks:
+        robot = subtask.robot
+        if robot is None or robot == "all" or is_unnamed(robot):
+            continue
+        at = facts.account.values[subtask.id] or facts.account.called[subtask.id]
+        meant = [governs[index] for index in at if governs[index]]
+        if meant and not any(robot in each for each in meant):
+            who = ", ".join(sorted(set[str]().union(*meant)))[:80]
+            yield Finding(
+                check="assignment", severity=Severity.HOLD,
+                message=f"{subtask.id} ({subtask.skill}) is given to {robot}, and the words give it to {who}",
+            )  # fmt: skip
+
+
+def _governors(facts: Facts) -> list[frozenset[str]]:
+    """For each token the robots that may be its subject; empty where none was named."""
+    tokens = facts.reading.tokens
+    values = set[int]().union(*facts.account.values.values()) if facts.account.values else set[int]()
+    subjects: list[tuple[int, int, frozenset[str]]] = []
+    number = 0
+    while number < len(tokens):
+        if not _subject(tokens, number, values):
+            number += 1
+            continue
+        first, last, robots = number, number, set(tokens[number].robots)
+        while True:
+            step = last + 1
+            while step < len(tokens) and tokens[step].text in _JOIN:
+                step += 1
+            if step == last + 1 or step >= len(tokens) or tokens[step].kind != "robot" or step in values:
+                break
+            robots |= set(tokens[step].robots)
+            last = step
+        subjects.append((first, last, frozenset(robots)))
+        number = last + 1
+    found: list[frozenset[str]] = []
+    for index in range(len(tokens)):
+        earlier = [robots for _, last, robots in subjects if last <= index]
+        sentence = facts.reading.sentence[index]
+        later = [
+            (first, robots)
+            for first, _, robots in subjects
+            if first > index and facts.reading.sentence[first] == sentence
+        ]
+        meant = set(earlier[-1]) if earlier else set[str]()
+        if later and (not earlier or _trails(tokens, later[0][0])):
+            meant |= later[0][1]
+        found.append(frozenset(meant))
+    return found
+
+
+def _subject(tokens: tuple[Token, ...], number: int, values: set[int]) -> bool:
+    if tokens[number].kind != "robot" or number in values or not tokens[number].robots:
+        return False
+    before = number - 1
+    while before >= 0 and tokens[before].text in ("the", "our", "my"):
+        before -= 1
+    return before < 0 or tokens[before].text not in _NOT_SUBJECT
+
+
+def _trails(tokens: tuple[Token, ...], first: int) -> bool:
+    """Whether a mention names who does what stands before it: at the end of its sentence, or after "with"."""
+    if first and tokens[first - 1].text in ("with", "using", "by", "via"):
+        return True
+    after = tokens[first + 1].text if first + 1 < len(tokens) else "."
+    return after in (".", "!", "?", ";", "\n")

@@ -1,0 +1,602 @@
+"""Checks of the words: every word of an instruction stands in its plan, and nothing else does. Pure.
+
+A plan runs unasked only where it accounts for all that was typed. What changes the meaning of an order (negation,
+exception, condition, time, alternative, correction, question) has a check of its own, so that a refusal names the real
+reason; all other words that are left over are found by `coverage`, and subtasks that no words ask for by `polarity`.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+
+from appliance.llm.checks import lexicon as lx
+from appliance.llm.checks.accounting import Claim, claims
+from appliance.llm.checks.finding import Facts, Finding, Severity
+from appliance.llm.checks.reading import Token
+from appliance.model import Subtask
+
+_CLOCK = re.compile(
+    r"\b(?:[01]?\d|2[0-3]):[0-5]\d\b|\b\d{1,2}\s*(?:am\b|pm\b|a\.m|p\.m|o'clock|h\b(?=\s*(?:sharp|today)))",
+    re.IGNORECASE,
+)
+_DELAYED = re.compile(
+    r"\b(?:in|after|within)\s+(?:about\s+|around\s+)?(?:a|an|half|\d+|two|three|four|five|six|ten|fifteen|twenty|thirty)"
+    r"(?:\s+(?:a|an|few|couple|of|more))*\s*(?:hours?|h|minutes?|mins?|seconds?|secs?|s|days?|weeks?)\b",
+    re.IGNORECASE,
+)
+_REPEATED = re.compile(
+    r"\b(?:every|each)\s+(?:other\s+|few\s+|\d+\s+|half\s+|two\s+|three\s+|five\s+|ten\s+|fifteen\s+|thirty\s+)*"
+    r"(?:hour|minute|min|second|sec|day|night|morning|evening|afternoon|week|month|shift|time|monday|tuesday|wednesday|"
+    r"thursday|friday|saturday|sunday)s?\b|\b(?:twice|once|three times)\s+(?:a|an|per|each|every)\s+\w+",
+    re.IGNORECASE,
+)
+_CLAUSE_END = frozenset((",", ";", ".", "!", "?", ":", "\n", "–", "—"))
+_SMALL = frozenset(
+    (",", ";", ".", "!", "?", ":", "\n", "-", "–", "—", "(", ")", "&", "'", "/", "*", "•", "_", "…", '"', "+")
+)
+
+
+class Scope(Finding, frozen=True, kw_only=True):
+    """A negated clause, and which subtasks do what it forbids."""
+
+    at: tuple[int, ...] = ()
+    broken_by: tuple[str, ...] = ()
+    kept: bool = False
+
+
+# --- what is left over ----------------------------------------------------------------------------------------------
+
+
+def left(facts: Facts) -> list[int]:
+    """Return the tokens that the plan does not account for, marks and small words included."""
+    kept = facts.account.covered | _phrased(facts) | forbidden(facts) | _conditions(facts)[0]
+    return [number for number in range(len(facts.reading.tokens)) if number not in kept]
+
+
+def _phrased(facts: Facts) -> set[int]:
+    """Tokens of runs of words that mean nothing by themselves."""
+    kept = facts.reading.memo.get(("filler", "", ""))
+    if kept is not None:
+        return set(kept)
+    found: set[int] = set()
+    tokens = facts.reading.tokens
+    texts = [each.text for each in tokens]
+    for words in _filler_phrases():
+        for start in range(len(texts) - len(words) + 1):
+            if texts[start] == words[0] and tuple(texts[start : start + len(words)]) == words:
+                found.update(range(start, start + len(words)))
+    facts.reading.memo["filler", "", ""] = frozenset(found)
+    return found
+
+
+@lru_cache(maxsize=1)
+def _filler_phrases() -> tuple[tuple[str, ...], ...]:
+    return tuple(sorted((tuple(each.split()) for each in lx.FILLER_PHRASES), key=len, reverse=True))
+
+
+def _clause_end(tokens: Sequence[Token], start: int, *, stops: frozenset[str] = frozenset(("but", "then"))) -> int:
+    """The index behind the last token of the clause that begins at `start`."""
+    index = start
+    while index < len(tokens):
+        each = tokens[index]
+        if index > start and ((each.kind == "mark" and each.text in _CLAUSE_END) or each.text in stops):
+            break
+        index += 1
+    return index
+
+
+# --- negation -------------------------------------------------------------------------------------------------------
+
+
+def _scopes(facts: Facts) -> list[Scope]:
+    """Each negated clause of the instruction."""
+    cached = facts.__dict__.get("_scopes")
+    if cached is not None:
+        return cached
+    tokens = facts.reading.tokens
+    account = facts.account
+    filler = _phrased(facts)
+    found: list[Scope] = []
+    behind = 0
+    options = claims(facts.reading, facts.catalogue)
+    for number, token in enumerate(tokens):
+        if number < behind or token.kind != "word" or token.text not in lx.NEGATIONS or number in filler:
+            continue
+        if number in account.covered and token.text not in ("not", "no", "never", "don't", "dont"):
+            continue
+        if number in _free_values(facts):
+            continue
+        end = _clause_end(tokens, number + 1)
+        at = tuple(range(number, end))
+        if _ends_only(tokens, number, end):
+            account.covered.add(number)
+            continue
+        behind = end
+        inside = set(at)
+        asked = [each for group in options for each in group[:2] if set(each.at) <= inside and each.at[0] > number]
+        broken = tuple(each.id for each in facts.plan.subtasks if _does(facts, each, asked, inside))
+        kept = bool(asked) and not broken
+        words = facts.words(at)
+        found.append(
+            Scope(
+                check="negation", severity=Severity.REFUSE if broken else Severity.HOLD, message=words, words=(words,),
+                at=at, broken_by=broken, kept=kept,
+            )
+        )  # fmt: skip
+    facts.__dict__["_scopes"] = found
+    return found
+
+
+def _ends_only(tokens: Sequence[Token], number: int, end: int) -> bool:
+    """Whether "stop" stands at the end of a way: "go to dock 1 and stop" (there)."""
+    rest = [each.text for each in tokens[number + 1 : end]]
+    return (
+        tokens[number].text in ("stop", "stops", "halt")
+        and number > 0
+        and set(rest) <= {"there", "here"}
+        and (tokens[number - 1].text in ("and", "then", ","))
+    )
+
+
+def _free_values(facts: Facts) -> set[int]:
+    """Tokens of texts that are spoken, asked, or waited for: what they forbid is no order."""
+    cached = facts.__dict__.get("_free")
+    if cached is None:
+        from appliance.llm.checks.accounting import free_said  # noqa: PLC0415
+        from appliance.llm.language.values import FREE  # noqa: PLC0415
+
+        cached = set[int]()
+        for subtask in facts.plan.subtasks:
+            for name, value in subtask.params.items():
+                if name in FREE and isinstance(value, str):
+                    cached |= free_said(facts.reading, value) or set()
+        facts.__dict__["_free"] = cached
+    return cached
+
+
+def _does(facts: Facts, subtask: Subtask, asked: Sequence[Claim], inside: set[int]) -> bool:
+    """Whether a subtask does what a negated clause forbids."""
+    account = facts.account
+    values, called = account.values[subtask.id], account.called[subtask.id]
+    names = any(subtask.skill in each.skills for each in asked)
+    if not names and not (subtask.skill == "goto" and values & inside and not values - inside):
+        return False
+    outside_call = called - inside
+    outside_value = values - inside
+    if not values:
+        return not outside_call
+    if values & inside and not outside_value:
+        return True
+    return names and not outside_call and not outside_value
+
+
+def forbidden(facts: Facts) -> set[int]:
+    """Tokens of negated clauses that the plan keeps."""
+    return {index for each in _scopes(facts) if each.kept for index in each.at}
+
+
+def negation(facts: Facts) -> Iterable[Finding]:
+    """A plan does nothing that the instruction forbids, and no negation is passed over."""
+    for scope in _scopes(facts):
+        if scope.broken_by:
+            does = ", ".join(scope.broken_by)
+            yield Finding(
+                check="negation", severity=Severity.REFUSE, words=scope.words,
+                message=f'the instruction forbids this action: "{scope.words[0]}", and the plan does it ({does})',
+                hint="say only what the robots are to do; to halt robots: swiftbot stop",
+            )  # fmt: skip
+        elif scope.kept:
+            inside = set(scope.at)
+            if not any(each - inside for each in facts.account.evidence.values()):
+                yield _hold("negation", f'"{scope.words[0]}" forbids something and asks for nothing', scope.words)
+            else:
+                yield Finding(
+                    check="negation", severity=Severity.NOTE, words=scope.words,
+                    message=f'not in the plan, as "{scope.words[0]}" says',
+                )  # fmt: skip
+        else:
+            yield _hold("negation", f'the plan does not account for "{scope.words[0]}"', scope.words)
+
+
+# --- conditions -----------------------------------------------------------------------------------------------------
+
+
+def _conditions(facts: Facts) -> tuple[set[int], list[tuple[int, tuple[int, ...]]]]:
+    """Tokens of conditions that the plan keeps, and those that it does not, each with its first token."""
+    cached = facts.__dict__.get("_conditions")
+    if cached is not None:
+        return cached
+    tokens = facts.reading.tokens
+    filler = _phrased(facts)
+    kept: set[int] = set()
+    lost: list[tuple[int, tuple[int, ...]]] = []
+    for number, token in enumerate(tokens):
+        if token.kind != "word" or token.text not in lx.CONDITIONS or number in filler or number in _free_values(facts):
+            continue
+        if token.text in ("case", "condition", "given", "else") and number in facts.account.covered:
+            continue
+        end = _clause_end(tokens, number + 1, stops=frozenset(("then", "otherwise")))
+        clause = tuple(range(number, end))
+        sentence = facts.reading.sentence[number]
+        governed = [
+            index for index in range(len(tokens)) if facts.reading.sentence[index] == sentence and index not in clause
+        ]
+        if (token.text in ("if", "provided", "providing") and _waits(facts, clause, governed)) or (
+            token.text == "if" and _only_reports(facts, set(governed), set(clause))
+        ):
+            kept |= set(clause)
+        else:
+            lost.append((number, clause))
+    facts.__dict__["_conditions"] = (kept, lost)
+    return kept, lost
+
+
+def _of(facts: Facts, indices: set[int]) -> list[Subtask]:
+    """Subtasks that these tokens ask for."""
+    return [each for each in facts.plan.subtasks if facts.account.evidence[each.id] & indices]
+
+
+def _waits(facts: Facts, clause: Sequence[int], governed: Sequence[int]) -> bool:
+    """Whether what a condition governs comes after a wait for it."""
+    waits = [each for each in facts.plan.subtasks if each.skill == "wait_for"]
+    content = {
+        index for index in clause[1:]
+        if facts.reading.tokens[index].kind != "mark" and facts.reading.tokens[index].text not in ("that", "and", "the")
+    }  # fmt: skip
+    for wait in waits:
+        if content <= facts.account.values[wait.id]:
+            after = [each for each in _of(facts, set(governed)) if each.id != wait.id]
+            return bool(after) and all(wait.id in facts.before[each.id] for each in after)
+    return False
+
+
+def _only_reports(facts: Facts, governed: set[int], clause: set[int]) -> bool:
+    """Whether what a condition governs only tells somebody something."""
+    manifest = facts.manifest
+    after = [each for each in facts.plan.subtasks if (facts.account.evidence[each.id] - clause) & governed]
+    return bool(after) and all((m := manifest(each)) is not None and m.reports for each in after)
+
+
+def condition(facts: Facts) -> Iterable[Finding]:
+    """What an order depends on is waited for before it is carried out."""
+    for number, clause in _conditions(facts)[1]:
+        words = facts.words(clause)
+        first = facts.reading.tokens[number].text
+        yield _hold(
+            "condition", f'the plan does not wait for "{words}"', (words,),
+            hint="wait for a person's answer instead, such as: wait for the all-clear from Ana, then ..."
+            if first != "otherwise" else "",
+        )  # fmt: skip
+
+
+def exception(facts: Facts) -> Iterable[Finding]:
+    """What an order leaves out is left out."""
+    tokens = facts.reading.tokens
+    kept = facts.account.covered | _phrased(facts) | forbidden(facts)
+    for number, token in enumerate(tokens):
+        if token.kind != "word" or token.text not in lx.EXCEPTIONS or number in kept:
+            continue
+        words = facts.words(range(number, _clause_end(tokens, number + 1)))
+        yield _hold("exception", f'the plan does not account for "{words}"', (words,))
+
+
+# --- times, alternatives, corrections, questions ----------------------------------------------------------------------
+
+
+def time(facts: Facts) -> Iterable[Finding]:
+    """Clock times, delays and repeats are not supported: a plan that passes one over cannot run."""
+    rest = set(left(facts))
+    tokens = facts.reading.tokens
+    found: list[int] = []
+    text = facts.reading.text
+    for match in (*_CLOCK.finditer(text), *_DELAYED.finditer(text), *_REPEATED.finditer(text)):
+        inside = [n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()]
+        if inside and any(index in rest and tokens[index].text not in lx.FILLERS for index in inside):
+            found += inside
+    if found:
+        words = facts.words(sorted(set(found)))
+        yield Finding(
+            check="time", severity=Severity.REFUSE, words=(words,),
+            message=f'clock times, delays and repeats are not supported yet: "{words}"',
+            hint="submit the order when it is due; a robot can wait up to 290 s, such as: wait 30 seconds, then ...",
+        )  # fmt: skip
+        return
+    for index in sorted(rest):
+        if tokens[index].kind == "word" and tokens[index].text in lx.TIMES:
+            word = tokens[index].text
+            hint = "clock times, delays and repeats are not supported yet: submit the order when it is due"
+            yield _hold("time", f'the plan does not account for "{word}"', (word,), hint=hint)
+            return
+
+
+def alternative(facts: Facts) -> Iterable[Finding]:
+    """An order that leaves a choice open is not decided by the planner."""
+    tokens = facts.reading.tokens
+    for number in left(facts):
+        if tokens[number].kind == "word" and tokens[number].text in lx.ALTERNATIVES:
+            words = facts.words(range(max(0, number - 2), min(len(tokens), number + 3)))
+            yield _hold("alternative", f'the words leave a choice open: "{words}"', (tokens[number].text,),
+                        hint="name the one that is meant")  # fmt: skip
+            return
+
+
+def correction(facts: Facts) -> Iterable[Finding]:
+    """A correction in mid-sentence is looked at by a person."""
+    tokens = facts.reading.tokens
+    for number in left(facts):
+        if tokens[number].kind == "word" and tokens[number].text in lx.CORRECTIONS:
+            yield _hold("correction", f'"{tokens[number].text}" takes something back', (tokens[number].text,),
+                        hint="say the order once, as it is meant")  # fmt: skip
+            return
+
+
+def question(facts: Facts) -> Iterable[Finding]:
+    """A question is no order, however courteous orders may end in a question mark."""
+    tokens = facts.reading.tokens
+    free = _free_values(facts)
+    for number, token in enumerate(tokens):
+        if token.text != "?" or number in free or number in facts.account.covered:
+            continue
+        sentence = facts.reading.sentence[number]
+        inside = [index for index in range(number) if facts.reading.sentence[index] == sentence]
+        words = [tokens[index].text for index in inside if tokens[index].kind == "word"]
+        if _courteous(words):
+            continue
+        subtasks = _of(facts, set(inside))
+        if words and words[0] in ("what", "how") and subtasks and all(_perceives(facts, each) for each in subtasks):
+            continue
+        yield _hold("question", "it reads as a question, not as an order", (facts.words(inside),),
+                    hint="ask for the state of robots with: swiftbot robots")  # fmt: skip
+
+
+def _courteous(words: Sequence[str]) -> bool:
+    body = [each for each in words if each not in ("hey", "hi", "hello", "ok", "okay", "so", "and", "then", "please")]
+    return len(body) > 1 and body[0] in ("could", "can", "would", "will") and body[1] in (
+        "you", "somebody", "someone", "we", "i", "one",
+    )  # fmt: skip
+
+
+def _perceives(facts: Facts, subtask: Subtask) -> bool:
+    manifest = facts.manifest(subtask)
+    return manifest is not None and not manifest.moves_robot and set(manifest.uses) <= {"camera", "microphone"}
+
+
+def pronoun(facts: Facts) -> Iterable[Finding]:
+    """A pronoun stands for something that was said before it."""
+    tokens = facts.reading.tokens
+    said = sorted(set[int]().union(*facts.account.values.values())) if facts.account.values else []
+    for number, token in enumerate(tokens):
+        if token.kind != "word" or token.text not in lx.PRONOUNS or number in _free_values(facts):
+            continue
+        before = (bool(said) and said[0] < number) or any(each.kind == "robot" for each in tokens[:number])
+        following = tokens[number + 1] if number + 1 < len(tokens) else None
+        if token.text in ("there", "here") and not before:
+            yield _hold("pronoun", f'nothing was said that "{token.text}" could mean', (token.text,))
+            return
+        if (
+            token.text in lx.THINGS
+            and following is not None
+            and number + 1 in facts.account.covered
+            and token.text in ("that", "this", "these", "those")
+        ):
+            continue
+        if not before and token.text not in ("here", "her", "his"):
+            yield _hold("pronoun", f'nothing was said that "{token.text}" could mean', (token.text,))
+            return
+    for subtask in facts.plan.subtasks:
+        for name, value in subtask.params.items():
+            spoken = name in ("text", "question", "event", "about", "to")
+            if isinstance(value, str) and not spoken and set(value.split()) & lx.NAMELESS:
+                yield _hold("pronoun", f'{subtask.id}: {name} is "{value}", which names nothing', (value,))
+
+
+# --- words and subtasks --------------------------------------------------------------------------------------------
+
+
+def quantity(facts: Facts) -> Iterable[Finding]:
+    """Every figure stands in the plan, with its unit."""
+    tokens = facts.reading.tokens
+    for number in left(facts):
+        token = tokens[number]
+        if token.kind == "number" and not _item(tokens, number):
+            yield _hold("quantity", f"{token.text} is said and stands nowhere in the plan", (token.text,))
+
+
+def _item(tokens: Sequence[Token], number: int) -> bool:
+    """Whether a figure numbers an item of a list."""
+    before = tokens[number - 1].text if number else "\n"
+    after = tokens[number + 1].text if number + 1 < len(tokens) else ""
+    if after == ")" and before != "(":
+        return True
+    return after in (")", ".", ":") and before in ("\n", ":", ";", ".", ",", "(") and "." not in tokens[number].text
+
+
+def coverage(facts: Facts) -> Iterable[Finding]:
+    """Every word stands in the plan, or says nothing by itself."""
+    tokens = facts.reading.tokens
+    special = lx.NEGATIONS | lx.CONDITIONS | lx.EXCEPTIONS | lx.TIMES | lx.ALTERNATIVES | lx.CORRECTIONS
+    scoped = {index for each in _scopes(facts) for index in each.at} | {
+        index for _, clause in _conditions(facts)[1] for index in clause
+    }
+    claimed = {index for each in facts.account.unclaimed for index in each.at}
+    unknown: list[int] = []
+    for number in left(facts):
+        token = tokens[number]
+        if number in scoped or number in claimed:
+            continue
+        if token.kind == "mark" and (token.text in _SMALL or token.text == "?"):
+            continue
+        if token.kind == "number":
+            continue
+        if token.kind == "word" and (token.text in special or token.text in lx.FILLERS):
+            continue
+        if token.kind == "word" and token.text in lx.RESULTS and _later(facts, number):
+            continue
+        if token.kind == "word" and token.text in lx.UNITS and number and tokens[number - 1].value is not None:
+            continue
+        if token.kind == "word" and token.text in ("up", "down", "back", "away") and _after_motion(facts, number):
+            continue
+        unknown.append(number)
+    if unknown:
+        words = tuple(dict.fromkeys(tokens[index].text for index in unknown))[:12]
+        shown = ", ".join(f'"{each}"' for each in words)
+        yield _hold(
+            "coverage",
+            f"the plan does not account for {shown}",
+            words,
+            hint="leave these words out, or say it otherwise",
+        )
+
+
+def _later(facts: Facts, number: int) -> bool:
+    """Whether some subtask was asked for before: a result of it may be spoken of."""
+    return any(evidence and min(evidence) < number for evidence in facts.account.evidence.values())
+
+
+def _after_motion(facts: Facts, number: int) -> bool:
+    return any(
+        number - 1 in facts.account.called[each.id]
+        for each in facts.plan.subtasks
+        if (m := facts.manifest(each)) is not None and m.moves_robot
+    )
+
+
+def polarity(facts: Facts) -> Iterable[Finding]:
+    """Each verb is carried out by a skill that it asks for, and each subtask is asked for by words."""
+    if facts.continued:
+        return
+    opposed = {
+        other for each in facts.plan.subtasks if (m := facts.manifest(each)) is not None for other in m.opposite_of
+    }
+    kept = forbidden(facts) | _conditions(facts)[0] | _phrased(facts)
+    for claim in facts.account.unclaimed:
+        if set(claim.at) <= kept or set(claim.at) & _free_values(facts):
+            continue
+        if all(facts.reading.tokens[index].text in lx.FILLERS for index in claim.at):
+            continue
+        if facts.reading.tokens[claim.at[0]].text in lx.RESULTS and _later(facts, claim.at[0]):
+            continue
+        asks = ", ".join(sorted(claim.skills))
+        if claim.skills & opposed:
+            yield Finding(
+                check="polarity", severity=Severity.REFUSE, words=(claim.text,),
+                message=f'"{claim.text}" asks for {asks}, and the plan does the opposite',
+            )  # fmt: skip
+        else:
+            yield _hold("polarity", f'"{claim.text}" asks for {asks}, which is not in the plan', (claim.text,))
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        if manifest is None:
+            continue
+        called = facts.account.called[subtask.id] - forbidden(facts)
+        implied = subtask.skill == "goto" and facts.account.values[subtask.id]
+        if not called and not implied and not _implied(facts, subtask):
+            yield _hold("polarity", f"no words ask for {subtask.id} ({subtask.skill})", ())
+
+
+def _implied(facts: Facts, subtask: Subtask) -> bool:
+    """Whether a way is there for a thing that the site knows to be at its end."""
+    return (
+        subtask.skill == "goto"
+        and facts.site is not None
+        and any(
+            facts.site.find(each.at) is facts.site.find(str(subtask.params.get("place", "")))
+            for each in facts.site.objects
+            if any(each.name == other.params.get("object") for other in facts.plan.subtasks)
+        )
+    )
+
+
+def unseen(facts: Facts) -> Iterable[Finding]:
+    """Characters that a person cannot see, or not tell apart, change no order."""
+    if facts.reading.hidden:
+        yield _hold("unseen", f"{facts.reading.hidden} invisible characters were in the text", ())
+    if facts.reading.mixed:
+        shown = ", ".join(ascii(each) for each in facts.reading.mixed[:4])
+        yield _hold("unseen", f"words mix letters of several scripts: {shown}", facts.reading.mixed[:4])
+
+
+# --- order ---------------------------------------------------------------------------------------------------------
+
+
+def sequence(facts: Facts) -> Iterable[Finding]:
+    """What the words order is ordered in the plan, and what they say of the same time is not."""
+    tokens = facts.reading.tokens
+    evidence = facts.account.evidence
+    for number, token in enumerate(tokens):
+        if token.kind != "word" or (
+            number in facts.account.covered and token.text not in lx.SEQUENCE | lx.SIDE_BY_SIDE
+        ):
+            continue
+        if token.text in lx.SEQUENCE:
+            first = [each for each in facts.plan.subtasks if evidence[each.id] and min(evidence[each.id]) < number]
+            second = [each for each in facts.plan.subtasks if evidence[each.id] and min(evidence[each.id]) > number]
+            if first and second:
+                forward = any(a.id in facts.before[b.id] for a in first for b in second)
+                back = any(
+                    b.id in facts.before[a.id] and max(evidence[a.id]) < number for a in first for b in second
+                ) and not _reordered(tokens)
+                if back or not forward:
+                    yield _hold("sequence", f'"{token.text}" is said, and the plan has another order', (token.text,))
+                    return
+        elif token.text in lx.SIDE_BY_SIDE or _phrase_here(tokens, number):
+            pairs = ((a, b) for n, a in enumerate(facts.plan.subtasks) for b in facts.plan.subtasks[n + 1 :])
+            if all(a.id in facts.before[b.id] or b.id in facts.before[a.id] for a, b in pairs):
+                yield _hold("sequence", f'"{token.text}" is said and nothing runs side by side', (token.text,))
+                return
+    yield from _before_after(facts)
+
+
+def _phrase_here(tokens: Sequence[Token], number: int) -> bool:
+    """Whether "at the same time" or "in parallel" ends here."""
+    texts = [each.text for each in tokens[max(0, number - 3) : number + 1]]
+    return texts[-4:] == ["at", "the", "same", "time"] or texts[-2:] == ["in", "parallel"]
+
+
+def repeated(facts: Facts) -> Iterable[Finding]:
+    """A plan does a thing twice only where the words say so."""
+    if any(each.text in lx.AGAIN or each.value is not None for each in facts.reading.tokens if each.kind == "word"):
+        return
+    seen: list[tuple[object, ...]] = []
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        what = (subtask.skill, subtask.robot, subtask.params)
+        if manifest is not None and not manifest.repeats and what in seen:
+            yield _hold("repeated", f"{subtask.id} ({subtask.skill}) is planned twice", ())
+        seen.append(what)
+
+
+def _reordered(tokens: Sequence[Token]) -> bool:
+    return any(each.text in ("before", "after", "once", "first", "when", "until") for each in tokens)
+
+
+def _before_after(facts: Facts) -> Iterable[Finding]:
+    tokens = facts.reading.tokens
+    for number, token in enumerate(tokens):
+        if token.kind != "word" or token.text not in ("before", "after") or number in facts.account.covered:
+            continue
+        if number + 1 < len(tokens) and tokens[number + 1].text == "that":
+            continue
+        end = _clause_end(tokens, number + 1)
+        clause = set(range(number, end))
+        sentence = facts.reading.sentence[number]
+        rest = {index for index in range(len(tokens)) if facts.reading.sentence[index] == sentence} - clause
+        inner = [
+            each
+            for each in facts.plan.subtasks
+            if facts.account.called[each.id] & clause and not facts.account.called[each.id] & rest
+        ]
+        outer = [
+            each
+            for each in facts.plan.subtasks
+            if facts.account.called[each.id] & rest and not facts.account.called[each.id] & clause
+        ]
+        if not inner or not outer:
+            continue
+        early, late = (outer, inner) if token.text == "before" else (inner, outer)
+        if not any(a.id in facts.before[b.id] for a in early for b in late):
+            yield _hold("sequence", f'"{token.text}" is said, and the plan has another order', (token.text,))
+
+
+def _hold(check: str, message: str, words: Sequence[str], hint: str = "") -> Finding:
+    return Finding(check=check, severity=Severity.HOLD, message=message, words=tuple(words), hint=hint)

@@ -1,0 +1,158 @@
+"""The review of a plan: one ordered list of named checks, run once for each candidate, wherever it comes from. Pure.
+
+Local, peer and upstream models, the cache, the rules, robots, templates and people hand in plans; all pass here. A
+check gives findings; the worst severity decides: `refuse` (it cannot run), `hold` (an operator approves it first) or
+run. No check can take back what another found, so the order of the list only orders the text. Of a plan that a person
+wrote or edited, checks of the words give notes: what they typed is the plan.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from appliance.llm.checks import consistency, robots, things, wording
+from appliance.llm.checks.contradiction import contradictions
+from appliance.llm.checks.finding import Facts
+from appliance.llm.checks.grounding import ungrounded
+from appliance.llm.checks.policy import policy_holds, unsafe
+from appliance.llm.checks.schema import MAX_PROBLEMS, validate
+from appliance.model import Finding, Severity, Verdict
+
+__all__ = ["CHECKS", "Check", "Facts", "Review", "review"]
+
+
+class Check(NamedTuple):
+    """A named check."""
+
+    name: str
+    run: Callable[[Facts], Iterable[Finding]]
+    words: bool = False
+    """Whether it is about the words: of an edited plan it then gives notes."""
+
+
+class Review(Struct, frozen=True, kw_only=True):
+    """What the checks found of one plan."""
+
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def decision(self) -> Verdict:
+        """What becomes of the plan."""
+        severities = {each.severity for each in self.findings}
+        if Severity.REFUSE in severities:
+            return Verdict.REFUSE
+        return Verdict.HOLD if Severity.HOLD in severities else Verdict.RUN
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Why it cannot run, each as a sentence."""
+        return tuple(each.message for each in self.findings if each.severity is Severity.REFUSE)
+
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """Why an operator approves it first, each as a sentence."""
+        return tuple(each.message for each in self.findings if each.severity is Severity.HOLD)
+
+    @property
+    def doubts(self) -> int:
+        """How many findings hold it that another plan for the same words might not have."""
+        return sum(each.severity is Severity.HOLD and each.check not in INTRINSIC for each in self.findings)
+
+
+def review(facts: Facts) -> Review:
+    """Run all checks on a plan; those of the words only on one whose form is right."""
+    found: list[Finding] = []
+    formed = True
+    for check in CHECKS:
+        if not formed and check.name not in _OF_ANY_FORM:
+            continue  # what cannot be a plan cannot be compared with words
+        if facts.continued and check.words and check.name not in _OF_A_REST:
+            continue  # the rest of a task accounts for the rest of the words
+        for each in check.run(facts):
+            softened = check.words and facts.edited and each.severity is not Severity.NOTE
+            found.append(replace(each, severity=Severity.NOTE) if softened else each)
+        formed = formed and not (check.name == "schema" and found)
+        if len(found) >= MAX_PROBLEMS:
+            break
+    return Review(findings=tuple(found[:MAX_PROBLEMS]))
+
+
+def _refusing(name: str, problems: Callable[[Facts], Iterable[str]]) -> Callable[[Facts], Iterable[Finding]]:
+    def run(facts: Facts) -> Iterable[Finding]:
+        for text in problems(facts):
+            yield Finding(check=name, severity=Severity.REFUSE, message=text)
+
+    return run
+
+
+def _schema(facts: Facts) -> Iterable[str]:
+    return validate(
+        facts.plan, facts.catalogue, robots=facts.robots, site=facts.site, require_implemented=facts.require_implemented
+    )
+
+
+def _policy(facts: Facts) -> Iterable[str]:
+    return unsafe(facts.plan, facts.context, facts.catalogue, facts.safety)
+
+
+def _grounding(facts: Facts) -> Iterable[str]:
+    return ungrounded(facts.plan, facts.context) if facts.safety.grounded else ()
+
+
+def _consistency(facts: Facts) -> Iterable[Finding]:
+    """The annotation rules of plans: what breaks one is never sure enough to run unasked."""
+    meaning = consistency.Meaning(
+        instruction=facts.instruction,
+        robots=tuple(each.id for each in facts.robots or ()),
+        domain=facts.plan.domain,
+        subtasks=facts.plan.subtasks,
+    )
+    for text in consistency.problems(meaning, facts.catalogue):
+        yield Finding(check="consistency", severity=Severity.HOLD, message=text)
+
+
+def _confidence(facts: Facts) -> Iterable[Finding]:
+    if facts.confidence < facts.run_from:
+        yield Finding(
+            check="confidence", severity=Severity.HOLD,
+            message=f"the planner is {facts.confidence:.2f} sure, and plans run unasked from {facts.run_from:.2f}",
+        )  # fmt: skip
+
+
+CHECKS: tuple[Check, ...] = (
+    Check("schema", _refusing("schema", _schema)),
+    Check("contradiction", _refusing("contradiction", lambda facts: contradictions(facts.plan))),
+    Check("policy", _refusing("policy", _policy)),
+    Check("grounding", _refusing("grounding", _grounding), words=True),
+    Check("negation", wording.negation, words=True),
+    Check("exception", wording.exception, words=True),
+    Check("condition", wording.condition, words=True),
+    Check("time", wording.time, words=True),
+    Check("alternative", wording.alternative, words=True),
+    Check("correction", wording.correction, words=True),
+    Check("question", wording.question, words=True),
+    Check("pronoun", wording.pronoun, words=True),
+    Check("quantity", wording.quantity, words=True),
+    Check("polarity", wording.polarity, words=True),
+    Check("coverage", wording.coverage, words=True),
+    Check("sequence", wording.sequence, words=True),
+    Check("repeated", wording.repeated, words=True),
+    Check("unseen", wording.unseen, words=True),
+    Check("unnamed_robot", robots.unnamed_robot, words=True),
+    Check("idle_robot", robots.idle_robot, words=True),
+    Check("assignment", robots.assignment, words=True),
+    Check("elsewhere", things.elsewhere),
+    Check("unknown_thing", things.unknown_thing, words=True),
+    Check("consistency", _consistency, words=True),
+    Check("confidence", _confidence, words=True),
+    Check("approval", policy_holds),
+)
+"""In the order in which their findings are listed."""
+_OF_ANY_FORM = frozenset(("schema", "contradiction", "consistency", "approval"))
+"""Checks that survive any plan that decodes."""
+_OF_A_REST = frozenset(("grounding", "confidence"))
+"""Checks of the words that hold for the rest of a task, too."""
+INTRINSIC = frozenset(("unnamed_robot", "approval", "unseen"))
+"""Checks whose findings another plan for the same words would have too: no further planner is asked."""
