@@ -27,6 +27,7 @@ from appliance.bench.mavlink import others
 from appliance.errors import PrerequisiteError
 from appliance.model import (
     Place,
+    RobotCommand,
     RobotInfo,
     Site,
     Subtask,
@@ -264,6 +265,36 @@ async def test_mavsdk_asks_for_a_task(field: Field, free_ports: Ports) -> None:
         for listener in listeners:
             listener.cancel()
         await asyncio.gather(*listeners, return_exceptions=True)
+
+
+async def test_mavsdk_shows_what_the_gateway_says(field: Field, free_ports: Ports) -> None:
+    """Its list is of the vehicle's system: refusals, and what an operator has said, short, full and long."""
+    await field.vehicle()
+    drone = await mavsdk(field, f"tcpout://127.0.0.1:{field.stations}", free_ports(1)[0])
+    shown: list[str] = []
+
+    async def read() -> None:
+        async for text in drone.telemetry.status_text():
+            shown.append(text.text)  # noqa: PERF401 - read while it grows
+
+    async def ask(template: int) -> None:
+        fields = {"target_system": 1, "target_component": 191, "command": 31010, "confirmation": 0}
+        fields |= {f"param{number}": 0 for number in range(2, 8)} | {"param1": template}
+        await drone.mavlink_direct.send_message(MavlinkMessage("COMMAND_LONG", 245, 190, 1, 191, json.dumps(fields)))
+
+    reading = asyncio.create_task(read())
+    try:
+        async with asyncio.timeout(60):
+            while not any("no template 99" in each for each in shown):
+                await ask(99)
+                await asyncio.sleep(0.3)
+        for number, words in enumerate(("look out", "x" * 50, "y" * 100, "z" * 400)):
+            order = RobotCommand(id=f"say-{number}", verb="say", args={"text": words})
+            await field.session.query(field.session.keys.command("drone_1"), encode(order), timeout_s=20.0)
+            await until(lambda words=words: words in shown)
+    finally:
+        reading.cancel()
+        await asyncio.gather(reading, return_exceptions=True)
 
 
 # --- MAVProxy ----------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG
 
 MARKER_V2 = 0xFD
 MARKER_V1 = 0xFE
+_STATUSTEXT = 253
 HEADER_V2, HEADER_V1, _CHECKSUM = 10, 6, 2
 
 
@@ -123,5 +124,7 @@ def as_v1(raw: bytes) -> bytes:
     if number > LAST_V1 or length is None:
         return b""
     payload = raw[HEADER_V2 : HEADER_V2 + size].ljust(length, b"\0")[:length]
+    if number == _STATUSTEXT and size > length and not any(payload[1:]):
+        return b""  # the empty part that ends a text: without its id it would be a text of its own
     body = bytes((length, sequence, system, component, number)) + payload
     return bytes((MARKER_V1,)) + body + checksum(body + KINDS[number].extra).to_bytes(2, "little")

@@ -10,7 +10,7 @@ import math
 import secrets
 
 from appliance.robots.commands import Done, Verb
-from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink import dialect, texts
 from appliance.robots.mavlink.craft import Craft
 from appliance.robots.mavlink.dialect import Message, constant, make
 from appliance.robots.mavlink.protocol import ask, command, command_at
@@ -258,11 +258,8 @@ class Payload:
                 tune2=tune[30:],
             )
         )
-        number = 0 if len(data) <= PART else 1 + secrets.randbelow(65_535)
-        for part, begin in enumerate(range(0, len(data), PART)):
-            vehicle.announce(
-                make("STATUSTEXT", severity=_NOTICE, text=data[begin : begin + PART], id=number, chunk_seq=part)
-            )
+        for each in texts.parts(data, _NOTICE):
+            vehicle.announce(each)
         return Done({"said": words, "tune": tune.decode(), "acknowledged": False} | self._craft.where())
 
 

@@ -57,10 +57,13 @@ class Texts:
         del began
         return None
 
-    def tick(self, now: float) -> None:
-        """Give up waiting for parts that do not come."""
-        for number in [number for number, (began, _, _) in self._open.items() if now - began > _PATIENCE_S]:
-            self._close(number)
+    def tick(self, now: float) -> list[Said]:
+        """Give up waiting for parts that do not come; return the texts as far as they came.
+
+        Some senders end a text with a full part: nothing but the time tells that it was the last one.
+        """
+        late = [number for number, (began, _, _) in self._open.items() if now - began > _PATIENCE_S]
+        return [self._close(number) for number in late]
 
     def since(self, at: float, now: float) -> tuple[str, ...]:
         """Return the words since a time that may explain a refusal, each once, oldest first."""

@@ -342,7 +342,8 @@ class Station:
         if each is None:
             return
         each.vehicle.send(message)
-        self._switch.announce(message, {attached.end for attached in self._by_source.values()})
+        vehicles = {attached.end for attached in self._by_source.values()}
+        self._switch.announce(message, vehicles, system=each.vehicle.system)
 
     # --- presence ----------------------------------------------------------------------------------------------
 

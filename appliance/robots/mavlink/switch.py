@@ -262,11 +262,11 @@ class Switch:
         key = keys.mavlink(vehicle, direction) if vehicle else keys.link_frames(self._gateway, str(end.link), direction)
         self._session.put(key, raw, encoding=FRAME_ENCODING)
 
-    def send(self, end: End, vehicle: str, message: Message) -> None:
-        """Send the gateway's own message to a vehicle."""
+    def send(self, end: End, vehicle: str, message: Message, *, system: int | None = None) -> None:
+        """Send the gateway's own message to a vehicle; `system`: as that system's onboard computer."""
         entry = self.links.get(end.link)
         if entry is not None:
-            self.record(end, vehicle, "tx", entry.link.send(message, end.address))
+            self.record(end, vehicle, "tx", entry.link.send(message, end.address, system=system))
 
     def greet(self, message: Message, reached: set[End]) -> None:
         """Send a heartbeat to all other ends that are known before they were heard, so that they know us."""
@@ -276,11 +276,16 @@ class Switch:
                 if end not in reached:
                     self.record(end, "", "tx", entry.link.send(message, other))
 
-    def announce(self, message: Message, vehicles: set[End]) -> None:
-        """Send a message to all ends that have been heard, but those of vehicles: ground stations, other routers."""
+    def announce(self, message: Message, vehicles: set[End], *, system: int) -> None:
+        """Send a message to all ends that have been heard, but those of vehicles: ground stations, other routers.
+
+        It is about a vehicle and comes from its onboard computer: stations show texts by system, and MAVSDK those of
+        its vehicle's system alone. Where a real companion computer has that address the gateway speaks as itself.
+        """
+        taken = self.router.knows(system, self._config.component_id)
         for end in self.router.ends:
             if end not in vehicles:
-                self.send(end, "", message)
+                self.send(end, "", message, system=None if taken else system)
 
     def link_list(self) -> LinkList:
         """All links, what went over them, and where each sender is."""

@@ -16,7 +16,7 @@ from appliance.robots.mavlink.condition import Condition
 from appliance.robots.mavlink.control import Control
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.modes import Modes, modes_of
-from appliance.robots.mavlink.said import WARNING, Texts
+from appliance.robots.mavlink.said import WARNING, Said, Texts
 from appliance.robots.mavlink.track import Report, Track
 
 Address = tuple[str, int]
@@ -213,6 +213,8 @@ class Vehicle:
         match frame.name:
             case "HEARTBEAT":
                 changed = self._heartbeat(frame, now) or changed
+                for said in self.texts.tick(now):
+                    self._said(said)
             case "GLOBAL_POSITION_INT":
                 self._position(message, now)
             case "SYS_STATUS" | "BATTERY_STATUS":
@@ -229,12 +231,16 @@ class Vehicle:
                 self.reached.add(message.seq)
             case "STATUSTEXT":
                 said = self.texts.take(message.severity, message.text, message.id, message.chunk_seq, now)
-                if said is not None and said.severity <= WARNING:
-                    self.text = said.text
+                if said is not None:
+                    self._said(said)
             case _:
                 pass
         self._pass_on(frame)
         return changed
+
+    def _said(self, said: Said) -> None:
+        if said.severity <= WARNING:
+            self.text = said.text
 
     def _pass_on(self, frame: Frame) -> None:
         """Hand a message to those who wait for it."""

@@ -15,6 +15,7 @@ from appliance.model.geo import to_globe, to_site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message, make
 from appliance.robots.mavlink.modes import Modes
+from appliance.robots.mavlink.texts import statustext
 from appliance.robots.sim import orders
 from appliance.robots.sim.board import Board, Sender
 from appliance.robots.sim.flight import Flight, Point
@@ -357,7 +358,7 @@ class Autopilot(abc.ABC, Generic[Body]):
 
     def say(self, severity: int, text: str) -> None:
         """Say something by STATUSTEXT."""
-        self._said.append(make("STATUSTEXT", severity=severity, text=text[:50].encode(), id=0, chunk_seq=0))
+        self._said += statustext(text, severity)
 
     def drain(self) -> list[Message]:
         """Return what it has to say, once."""
