@@ -84,6 +84,7 @@ async def test_no_robot_of_senders_that_are_no_vehicle(tmp_path: Path) -> None:
     async with gateway_process(tmp_path) as it:
         end = it.connect("udp", await it.link("udp"))
         senders = [beats(*each) for each in ((7, 1), (0, 1), (0, 0), (5, 0), (255, 190))]
+        senders += [beats(40 + kind, type=kind) for kind in (0, 5, 26)]  # generic, antenna tracker, gimbal
 
         def act() -> None:
             for beat in senders:
@@ -93,7 +94,7 @@ async def test_no_robot_of_senders_that_are_no_vehicle(tmp_path: Path) -> None:
         code, printed = await swiftbot(it.fleet, "robots", "list")
         assert code == 0
         assert "drone_7" in printed
-        assert not {"drone_0", "drone_5", "drone_255"} & set(it.robots())
+        assert set(it.robots()) == {"drone_7"}
         code, printed = await swiftbot(it.fleet, "robots", "forget", "drone_7")
         assert code != 0
         assert "drone_7 is online" in printed

@@ -215,6 +215,16 @@ MULTIROTORS = frozenset(
     constant(f"MAV_TYPE_{name}")
     for name in ("QUADROTOR", "HEXAROTOR", "OCTOROTOR", "TRICOPTER", "COAXIAL", "HELICOPTER", "DODECAROTOR")
 )
+VEHICLES = MULTIROTORS | frozenset(
+    constant(f"MAV_TYPE_{name}")
+    for name in (
+        "FIXED_WING", "AIRSHIP", "FREE_BALLOON", "ROCKET", "GROUND_ROVER", "SURFACE_BOAT", "SUBMARINE", "FLAPPING_WING",
+        "KITE", "VTOL_DUOROTOR", "VTOL_QUADROTOR", "VTOL_TILTROTOR", "VTOL_RESERVED2", "VTOL_RESERVED3",
+        "VTOL_RESERVED4", "VTOL_RESERVED5", "PARAFOIL", "DECAROTOR", "GENERIC_MULTIROTOR", "SPACECRAFT_ORBITER",
+        "GROUND_QUADRUPED", "VTOL_GYRODYNE",
+    )
+)  # fmt: skip
+"""Types of what moves by itself. Any other, also one that is not known here, is a component or a station."""
 COMPONENT_AUTOPILOT = constant("MAV_COMP_ID_AUTOPILOT1")
 COMPONENT_CAMERA = constant("MAV_COMP_ID_CAMERA")
 COMPONENT_GIMBAL = constant("MAV_COMP_ID_GIMBAL")

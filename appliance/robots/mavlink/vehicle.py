@@ -62,7 +62,9 @@ _PERIPHERALS = 100
 
 
 def is_autopilot(frame: Frame) -> bool:
-    """Tell whether a frame is the heartbeat of an autopilot: not of a camera, a gimbal or a ground station.
+    """Tell whether a frame is the heartbeat of a vehicle's autopilot: not of a camera, a gimbal or a ground station.
+
+    Some components and stations name an autopilot too, so the type is looked at as well.
 
     Components share their vehicle's system id and beat too; the first one heard is often not the autopilot. System and
     component 0 are addresses for all, and no sender's own (MAVLink guide, "Routing").
@@ -72,7 +74,7 @@ def is_autopilot(frame: Frame) -> bool:
         and frame.system != 0
         and 0 < frame.component < _PERIPHERALS
         and frame.message.autopilot != dialect.AUTOPILOT_NONE
-        and frame.message.type != dialect.TYPE_GROUND_STATION
+        and frame.message.type in dialect.VEHICLES
     )
 
 
@@ -276,6 +278,8 @@ class Vehicle:
             if frame.component in self.components or len(self.components) < MAX_COMPONENTS:
                 self.components[frame.component] = message.type
             return False
+        if not is_autopilot(frame):
+            return False  # somebody else with its address, or not a vehicle any more: what it was is not changed
         before = (self.custom_mode, self.armed, self.kind, self.autopilot)
         self.heard_at = now
         self.kind, self.autopilot = message.type, message.autopilot

@@ -1,12 +1,14 @@
 """Senders that are no vehicle make no robot: addresses for all, ground stations, cameras; and rows can be removed."""
 
 import asyncio
+import itertools
 import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega
 
 from appliance.errors import NotFoundError, RefusedError
 from appliance.model import RobotInfo
@@ -14,7 +16,7 @@ from appliance.plane.roster import Roster
 from appliance.ports import free_port
 from appliance.robots.api import RobotForget
 from appliance.robots.hub import RobotHub
-from appliance.robots.mavlink.dialect import Codec, frame_length, make
+from appliance.robots.mavlink.dialect import VEHICLES, Codec, frame_length, label, make
 from appliance.robots.settings import RobotsConfig
 from tests.unit.robots.conftest import FakeStore
 from tests.unit.robots.links import BEAT, LINKS, Wire, beside, sender, station, until
@@ -38,6 +40,56 @@ async def test_no_sender_that_is_none_makes_a_robot(kind: str) -> None:
         assert made.attached == ("drone_77",)
         assert not [each for each in made._switch.router.routes if each[0] == 0]
         assert all(each.system for link in made.link_list().links for each in link.senders)
+
+
+_TYPES: dict[int, Any] = ardupilotmega.enums["MAV_TYPE"]
+_COMPONENTS = [each for each in _TYPES if each not in VEHICLES and not _TYPES[each].name.endswith("ENUM_END")]
+
+
+def test_types_that_move_are_vehicles() -> None:
+    """Each type of MAVLink is one or the other; a new one has to be looked at here."""
+    names = {label("MAV_TYPE", each).removeprefix("MAV_TYPE_") for each in _COMPONENTS}
+    assert names == {
+        "GENERIC", "ANTENNA_TRACKER", "GCS", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION",
+        "FLARM", "SERVO", "ODID", "BATTERY", "PARACHUTE", "LOG", "OSD", "IMU", "GPS", "WINCH", "ILLUMINATOR", "GRIPPER",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["udp listen", "tcp listen"])
+async def test_components_that_name_an_autopilot_make_no_robot(kind: str) -> None:
+    """Whatever autopilot they name, also a type that nobody knows; vehicles of each type do."""
+    async with beside(kind, sender_hz=0.0, max_vehicles=250) as (made, _, outside, vehicle):
+        types = [*_COMPONENTS, 200]
+        frames = [
+            Codec(number + 1, 1).pack(make("HEARTBEAT", **(BEAT | {"type": each, "autopilot": autopilot})))
+            for number, (each, autopilot) in enumerate(itertools.product(types, (0, 3, 12)))
+        ]
+        codecs = {Codec(150 + number, 1): each for number, each in enumerate(sorted(VEHICLES))}
+
+        def act() -> None:
+            outside.write(*frames)
+            for codec, each in codecs.items():
+                vehicle(codec.pack(make("HEARTBEAT", **(BEAT | {"type": each}))))
+
+        await until(lambda: len(made.attached) >= len(VEHICLES), act)
+        await until(lambda: len(made._guests) >= len(frames), act)
+        assert {int(each.removeprefix("drone_")) for each in made.attached} == {each.system for each in codecs}
+
+
+async def test_a_vehicle_is_not_made_a_gimbal() -> None:
+    """A heartbeat with its address and another type changes nothing of it."""
+    port = free_port(socket.SOCK_DGRAM)
+    async with station(port) as (made, _), sender(port) as send:
+        codec = Codec(7, 1)
+        await until(lambda: made.attached, lambda: send(codec.pack(make("HEARTBEAT", **BEAT))))
+        (each,) = made._vehicles.values()
+        odd = BEAT | {"type": 26, "custom_mode": 9, "base_mode": 128}
+        before = made.link_list().links[0].frames_in
+        await until(
+            lambda: made.link_list().links[0].frames_in > before + 3,
+            lambda: send(codec.pack(make("HEARTBEAT", **odd))),
+        )
+        assert (each.vehicle.kind, each.vehicle.mode, each.vehicle.armed) == (2, "GUIDED", False)
 
 
 async def test_a_real_flight_makes_one_robot(data: Path) -> None:
