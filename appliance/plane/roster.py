@@ -5,10 +5,12 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 
+import msgspec
 from msgspec.structs import replace
 
 from appliance.model import RobotInfo
-from appliance.plane.session import Closer, Session
+from appliance.model.plausible import plausible, read_robot
+from appliance.plane.session import Closer, Message, Session
 
 ROBOT_KEPT_S = 300.0
 """How long a robot that went offline is still shown."""
@@ -32,7 +34,7 @@ class Roster:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
         self._closers = [
-            session.subscribe_typed(keys.robot(), RobotInfo, self._on_robot),
+            session.subscribe(keys.robot(), self._heard),
             session.watch_alive(keys.robot_alive(), self._on_alive),
         ]
         self._sweeping = asyncio.create_task(self._keep_sweeping(), name="roster")
@@ -41,10 +43,27 @@ class Roster:
         """Learn of robots from a gateway that knows them; what they said themselves is newer."""
         for robot in robots:
             if robot.id not in self.robots and len(self.robots) < MOST_ROBOTS:
-                self.robots[robot.id] = robot
+                self.robots[robot.id] = self._believed(robot)
                 if not robot.online:
                     self._gone[robot.id] = time.monotonic()
                 self._on_change()
+
+    def _heard(self, message: Message) -> None:
+        info = None
+        if not message.deleted:
+            try:
+                info = read_robot(message.payload)
+            except msgspec.DecodeError as error:
+                self._session.refuse("malformed robot/*/state", key=message.key, reason=str(error))
+                return
+        self._on_robot(message.key, info)
+
+    def _believed(self, info: RobotInfo) -> RobotInfo:
+        """Return a robot's state without numbers that cannot be, which are counted."""
+        believed, dropped = plausible(info)
+        if dropped:
+            self._session.refuse("implausible robot/*/state", robot=info.id, left_out=", ".join(dropped))
+        return believed
 
     def _on_robot(self, key: str, info: RobotInfo | None) -> None:
         robot = key.split("/")[-2]
@@ -60,7 +79,7 @@ class Roster:
         if robot not in self.robots and len(self.robots) >= MOST_ROBOTS:
             self._session.refuse("too many robot/*/state", key=key)
             return
-        before = self.robots.get(robot)
+        before, info = self.robots.get(robot), self._believed(info)
         self.robots[robot] = info
         if info.online:
             self._gone.pop(robot, None)

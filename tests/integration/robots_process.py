@@ -1,6 +1,7 @@
 """A gateway process with MAVLink links of each kind: bytes go in at its sockets, and what users see comes out."""
 
 import asyncio
+import json
 import socket
 import sys
 from collections.abc import AsyncGenerator, Callable
@@ -8,6 +9,7 @@ from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
 
+import zenoh
 from fleets import PLAIN, fleet_in
 from msgspec.structs import replace
 
@@ -117,3 +119,11 @@ async def swiftbot(fleet: FleetState, *arguments: str) -> tuple[int, str]:
     )  # fmt: skip
     printed, _ = await process.communicate()
     return process.returncode or 0, printed.decode()
+
+
+def open_zenoh(fleet: FleetState) -> zenoh.Session:
+    """Open a plain session, as a robot's own program does."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps(fleet.endpoints))
+    return zenoh.open(config)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from robots_process import BEAT, STATION, beats, gateway_process, read_frames, swiftbot
+from robots_process import BEAT, STATION, beats, gateway_process, open_zenoh, read_frames, swiftbot
 
 from appliance.model import Notice
 from appliance.robots.mavlink.dialect import Codec, make
@@ -193,3 +193,50 @@ async def test_a_station_that_sends_no_heartbeat_is_served(tmp_path: Path) -> No
         assert set(it.robots()) == {"drone_1"}
         lists, _ = await it.client.robot_links(it.gateway)
         assert "255/190" in lists[it.gateway].routes
+
+
+async def test_absurd_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
+    """A vehicle's and a Zenoh robot's: neither the list nor its JSON shows them, and what can be is shown."""
+    async with gateway_process(tmp_path) as it:
+        end = it.connect("udp", await it.link("udp"))
+        codec, beat = Codec(1, 1), beats(1)
+        place = {"lat": 473977420, "lon": 85455940, "alt": 500_000, "relative_alt": 5_000, "vx": 300, "vy": 0, "vz": 0}
+        absurd = place | {"lat": 2_000_000_000, "alt": -(2**31)}
+        session = await asyncio.to_thread(open_zenoh, it.fleet)
+        key = f"swiftbot/{it.fleet.fleet}/robot/cart_1"
+        token = session.liveliness().declare_token(f"{key}/alive")
+        verbs = ", ".join(f'"v{number}"' for number in range(20_000))
+        state = (
+            '{"id": "cart_1", "kind": "zenoh", "battery_percent": -500, "speed_mps": -1e30, "mode": "AUTO", '
+            f'"pose": {{"x": NaN}}, "home": {{"x": 3.0}}, "verbs": [{verbs}]}}'
+        )
+
+        def act() -> None:
+            end.send(beat())
+            for number, fields in enumerate((place, absurd)):
+                position = make("GLOBAL_POSITION_INT", time_boot_ms=number, hdg=9000 + 50_000 * number, **fields)
+                end.send(codec.pack(position))
+            session.put(f"{key}/state", state.encode(), encoding="application/json")
+
+        try:
+            await it.until(
+                lambda: (
+                    {"drone_1", "cart_1"} <= set(it.robots())
+                    and it.robots()["drone_1"].pose is not None
+                    and it.refused().get("implausible", 0) > 1
+                    and it.refused().get("implausible robot/*/state", 0) > 1
+                ),
+                act,
+            )
+            cart, drone = it.robots()["cart_1"], it.robots()["drone_1"]
+            assert (cart.battery_percent, cart.speed_mps, cart.pose, cart.verbs) == (None, None, None, ())
+            assert cart.home is not None
+            assert (cart.mode, cart.home.x, cart.online) == ("AUTO", 3.0, True)
+            assert drone.pose is not None
+            assert (drone.speed_mps, drone.pose.heading_deg) == (3.0, 90.0)
+            code, printed = await swiftbot(it.fleet, "robots", "list", "--json")
+            assert code == 0
+            assert not [each for each in ("NaN", "e+30", "-500", "v19999") if each in printed]
+        finally:
+            token.undeclare()
+            await asyncio.to_thread(session.close)

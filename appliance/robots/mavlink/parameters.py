@@ -5,6 +5,7 @@ holds afterwards, which need not be the one asked for.
 """
 
 import asyncio
+import math
 import re
 import struct
 
@@ -87,7 +88,7 @@ async def _exchange(vehicle: Vehicle, name: str, request: Message, patience: Pat
                 async with asyncio.timeout(patience.timeout_s):
                     while True:
                         answer = await answers.get()
-                        if _text(answer.param_id) == name:
+                        if _text(answer.param_id) == name and math.isfinite(answer.param_value):
                             return float(answer.param_value)
             except TimeoutError:
                 continue

@@ -278,6 +278,8 @@ async def _turned(answers: asyncio.Queue[Message], pitch_deg: float) -> bool:
         async with asyncio.timeout(_GIMBAL_S):
             while True:
                 w, x, y, z = (await answers.get()).q
+                if not all(math.isfinite(each) for each in (w, x, y, z)):
+                    continue  # not known: no angle
                 pitch = math.degrees(math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))))
                 if abs(pitch - pitch_deg) <= _NEAR_DEG:
                     return True

@@ -262,7 +262,13 @@ class Station:
     def _attach(self, name: str, source: End) -> _Attached:
 
         own = self._config.system_id
-        vehicle = Vehicle(name, site=self._site, send=lambda message: self._send(name, message), own=own)
+        vehicle = Vehicle(
+            name,
+            site=self._site,
+            send=lambda message: self._send(name, message),
+            own=own,
+            implausible=lambda _: self._count("implausible"),
+        )
         vehicle.announce = lambda message: self._announce(name, message)
         helm = Helm(vehicle, site=self._site, config=self._config)
         ledger = Ledger(name, self._store, limit=self._config.ledger)

@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 
 from appliance.model import Pose, RobotInfo, Site
 from appliance.model.geo import to_site
+from appliance.model.plausible import plausible_altitude, plausible_battery, plausible_item, plausible_place
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.condition import Condition
 from appliance.robots.mavlink.control import Control
@@ -22,6 +23,7 @@ from appliance.robots.mavlink.track import Report, Track
 Address = tuple[str, int]
 
 _NO_HEADING = 65535
+_FULL_TURN = 36_000
 _NO_BATTERY = -1
 _UNKNOWN_TOTAL = 65535
 MAX_COMPONENTS = 16
@@ -81,8 +83,18 @@ def is_autopilot(frame: Frame) -> bool:
 class Vehicle:
     """One vehicle. `send` puts a message on its link; `now` of `hear` is monotonic seconds."""
 
-    def __init__(self, name: str, *, site: Site, send: Callable[[Message], None], own: int = 0) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        site: Site,
+        send: Callable[[Message], None],
+        own: int = 0,
+        implausible: Callable[[str], None] = lambda _: None,
+    ) -> None:
         self.name = name
+        self._implausible = implausible
+        """Told each value that cannot be, by its field's name."""
         self.own = own
         """System id that the gateway speaks as, so that answers to others are told from those to it; 0: not told."""
         self.site = site
@@ -220,17 +232,14 @@ class Vehicle:
             case "GLOBAL_POSITION_INT":
                 self._position(message, now)
             case "SYS_STATUS" | "BATTERY_STATUS":
-                if message.battery_remaining != _NO_BATTERY:
-                    self.battery_percent = float(message.battery_remaining)
+                self._battery(float(message.battery_remaining))
             case "HOME_POSITION":
-                self.home = (message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+                self._home((message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3))
             case "MISSION_CURRENT":
-                self.mission_at = message.seq
-                self.mission_complete = message.mission_state == 5
-                if message.total != _UNKNOWN_TOTAL:
-                    self.mission_items = message.total
+                self._mission(message)
             case "MISSION_ITEM_REACHED":
-                self.reached.add(message.seq)
+                if self._fits("mission item", plausible_item(message.seq)):
+                    self.reached.add(message.seq)
             case "STATUSTEXT":
                 said = self.texts.take(message.severity, message.text, message.id, message.chunk_seq, now)
                 if said is not None:
@@ -239,6 +248,12 @@ class Vehicle:
                 pass
         self._pass_on(frame)
         return changed
+
+    def _fits(self, field: str, fits: bool) -> bool:
+        """Return whether a value can be; one that cannot is counted, and what was known before stays."""
+        if not fits:
+            self._implausible(field)
+        return fits
 
     def _said(self, said: Said) -> None:
         if said.severity <= WARNING:
@@ -289,12 +304,33 @@ class Vehicle:
         failsafe = self.condition.failsafe
         return self.control.hear(self.custom_mode, self.armed, failsafe, self.modes, now) or changed
 
+    def _battery(self, percent: float) -> None:
+        if percent != _NO_BATTERY and self._fits("battery", plausible_battery(percent)):
+            self.battery_percent = percent
+
+    def _home(self, home: tuple[float, float, float]) -> None:
+        if self._fits("home", plausible_place(*home[:2]) and plausible_altitude(home[2])):
+            self.home = home
+
+    def _mission(self, message: Message) -> None:
+        if self._fits("mission item", plausible_item(message.seq)):
+            self.mission_at = message.seq
+        self.mission_complete = message.mission_state == 5
+        if message.total != _UNKNOWN_TOTAL and self._fits("mission items", plausible_item(message.total)):
+            self.mission_items = message.total
+
     def _position(self, message: Message, now: float) -> None:
-        self.latitude_deg, self.longitude_deg = message.lat / 1e7, message.lon / 1e7
-        self.altitude_m, self.relative_m = message.alt / 1e3, message.relative_alt / 1e3
-        self.speed_mps = math.hypot(message.vx, message.vy, message.vz) / 100.0
-        if message.hdg != _NO_HEADING:
+        self.speed_mps = math.hypot(message.vx, message.vy, message.vz) / 100.0  # 16 bits: at most 567 m/s
+        if message.hdg != _NO_HEADING and self._fits("heading", message.hdg <= _FULL_TURN):
             self.heading_deg = message.hdg / 100.0
+        altitude, relative = message.alt / 1e3, message.relative_alt / 1e3
+        place = (message.lat / 1e7, message.lon / 1e7)
+        heights = plausible_altitude(altitude) and plausible_altitude(relative)
+        # A position counts whole or not at all: a new place at an old height is none where the vehicle has been.
+        if not self._fits("position", plausible_place(*place) and heights):
+            return
+        self.latitude_deg, self.longitude_deg = place
+        self.altitude_m, self.relative_m = altitude, relative
         # 0, 0 is what autopilots send before they know: the sea off Ghana is no site.
         self.fixed = message.lat != 0 or message.lon != 0
         if (pose := self.pose) is not None:
