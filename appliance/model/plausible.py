@@ -98,6 +98,7 @@ _FIELDS: dict[str, tuple[Callable[[Any], bool], Any]] = {
     "warnings": (_texts(MAX_LIST, MAX_TEXT), ()),
     "failsafe": (_text(MAX_TEXT), ""),
     "seized": (_text(MAX_TEXT), ""),
+    "speaker": (_text(MAX_NAME), ""),
 }
 """What each field may be, and what stands in its place when it is not."""
 _LIMITS: dict[str, float] = {"speed_mps": MAX_MPS, "altitude_m": HIGHEST_M, "payload_kg": 1e6, "range_m": 1e8}

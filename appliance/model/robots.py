@@ -62,6 +62,9 @@ class RobotInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What is not well and no failsafe: `battery low`."""
     failsafe: str = ""
     """Failsafes in force at the vehicle, in words."""
+    speaker: str = ""
+    """Which of those that go by this name speaks: made when it starts, in the order of those times. Of two the older is
+    believed; empty: it does not say."""
     seized: str = ""
     """Why the gateway does not command it at present: a pilot or a failsafe has it. Empty when it does."""
 

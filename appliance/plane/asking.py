@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 import structlog
 import zenoh
@@ -77,6 +78,31 @@ class Asking:
             async with asyncio.timeout(timeout_s):
                 await ended.wait()
         return list(messages)
+
+    async def answerers(self, key: str, payload: bytes, *, timeout_s: float) -> int:
+        """Ask everybody who serves a key, and return how many answered in time, whatever they said."""
+        found: set[str] = set()
+        ended = asyncio.Event()
+        inbox = self._wire.inbox
+
+        def take(reply: zenoh.Reply) -> None:
+            who = reply.replier_id
+            inbox.post(partial(found.add, f"{who.zid}/{who.eid}" if who is not None else f"{len(found)}"), must=True)
+
+        ask = partial(
+            self._wire.raw.get,
+            key,
+            threads.callback(take, drop=partial(inbox.post, ended.set, must=True)),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=payload,
+        )
+        self._wire.send(key, cast("Callable[[], None]", ask), len(payload))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return len(found)
 
     def get(
         self,

@@ -104,6 +104,10 @@ class Registry:
                 session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
             ]
 
+    def doubtful(self, robot: str) -> bool:
+        """Whether more than one may carry out what this robot is ordered."""
+        return self._roster.doubtful(robot)
+
     # --- our own facts ----------------------------------------------------------------------------------------
 
     def publish_status(self, status: GatewayStatus) -> None:

@@ -16,6 +16,10 @@ ROBOT_KEPT_S = 300.0
 """How long a robot that went offline is still shown."""
 MOST_ROBOTS = 10_000
 """Bound on what is believed."""
+SPEAKER_S = 3.0
+"""A robot that has said nothing for so long may be followed by another of its name, such as itself after a restart."""
+RIVAL_S = 15.0
+"""How long it is shown that a second one used the name."""
 _TICK_S = 5.0
 
 
@@ -27,6 +31,10 @@ class Roster:
         self._session = session
         self._on_change = on_change
         self._gone: dict[str, float] = {}
+        self._speakers: dict[str, tuple[str, float]] = {}
+        """Who speaks for each name, and when it did last."""
+        self._rivals: dict[str, float] = {}
+        """When another was last heard that uses the name."""
         self._closers: list[Closer] = []
         self._sweeping: asyncio.Task[None] | None = None
 
@@ -65,11 +73,39 @@ class Roster:
             self._session.refuse("implausible robot/*/state", robot=info.id, left_out=", ".join(dropped))
         return believed
 
+    def doubtful(self, robot: str) -> bool:
+        """Whether more than one may carry out what this robot is ordered: they have to be counted first."""
+        info = self.robots.get(robot)
+        if info is None or info.gateway:
+            return False  # its gateway sees to it that it is one
+        return not info.speaker or self._contested(robot)
+
+    def _contested(self, robot: str) -> bool:
+        return time.monotonic() - self._rivals.get(robot, -RIVAL_S) < RIVAL_S
+
+    def _heeded(self, info: RobotInfo) -> bool:
+        """Whether this one speaks for its name: the older one of two does, in every roster."""
+        if not info.speaker:
+            return True
+        now = time.monotonic()
+        speaker, heard_at = self._speakers.get(info.id, (info.speaker, now))
+        if speaker != info.speaker and now - heard_at < SPEAKER_S:
+            self._session.refuse("namesake robot/*/state", robot=info.id)
+            self._rivals[info.id] = now
+            if speaker < info.speaker:
+                return False
+        elif speaker != info.speaker:
+            self._rivals.pop(info.id, None)
+        self._speakers[info.id] = (info.speaker, now)
+        return True
+
     def _on_robot(self, key: str, info: RobotInfo | None) -> None:
         robot = key.split("/")[-2]
         if info is None:
             # Somebody removed its row: a robot that is merely gone is put as offline, or its token ends.
             self._gone.pop(robot, None)
+            self._speakers.pop(robot, None)
+            self._rivals.pop(robot, None)
             if self.robots.pop(robot, None) is not None:
                 self._on_change()
             return
@@ -80,6 +116,11 @@ class Roster:
             self._session.refuse("too many robot/*/state", key=key)
             return
         before, info = self.robots.get(robot), self._believed(info)
+        if not self._heeded(info):
+            return
+        if self._contested(robot):
+            note = f"another robot calls itself {robot}: give it a name of its own"
+            info = replace(info, note=f"{note}; {info.note}" if info.note else note)
         self.robots[robot] = info
         if info.online:
             self._gone.pop(robot, None)
@@ -105,6 +146,8 @@ class Roster:
             before = time.monotonic() - ROBOT_KEPT_S
             for robot in [each for each, since in self._gone.items() if since < before]:
                 del self._gone[robot]
+                self._speakers.pop(robot, None)
+                self._rivals.pop(robot, None)
                 self.robots.pop(robot, None)
                 self._on_change()
 

@@ -61,6 +61,7 @@ class Session:
         self.query = self._asking.query
         self.ask = self._asking.ask
         self.query_all = self._asking.query_all
+        self.answerers = self._asking.answerers
         self.make_way, self.known_way = direct.make_way, direct.known_way
         self.ask_here, self.forget = direct.ask_here, direct.forget
         self.declare_alive = presence.declare_alive

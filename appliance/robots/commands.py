@@ -32,6 +32,8 @@ GRACE_S = 2.0
 """How much longer than that the caller waits for the answer."""
 UNREACHABLE_S = 8.0
 """A robot that nobody has answered for so long is given up: a restarting gateway is back sooner."""
+_COUNT_S = 1.0
+"""How long those that go by a name have to say that they are there."""
 _ASK_AGAIN_S = 0.2
 _STOP_TIMEOUT_S = 3.0
 _MAX_ID = 200
@@ -296,11 +298,15 @@ _stopping: set[asyncio.Task[None]] = set()
 """Stops on their way, kept from the garbage collector."""
 
 
-async def send_command(session: Session, robot: str, command: RobotCommand, *, timeout_s: float) -> RobotReply:
+async def send_command(
+    session: Session, robot: str, command: RobotCommand, *, timeout_s: float, doubtful: bool = False
+) -> RobotReply:
     """Give a robot a command and wait for what comes of it.
 
     The same id is sent again while the deadline allows, so a lost query, a restarting gateway and a second caller
     with the same command do no harm. Cancelled, or at its deadline, it tells the robot to stop that command.
+
+    `doubtful`: more than one may go by that name, and each would carry it out. Those that answer are counted first.
 
     Returns:
         The robot's reply; what the robot could not do is in its `failure` and raises nothing.
@@ -311,6 +317,8 @@ async def send_command(session: Session, robot: str, command: RobotCommand, *, t
         RobotError: the answer is no RobotReply.
         SwiftbotError: what else the answering side refused, such as PayloadError.
     """
+    if doubtful and (namesakes := await _namesakes(session, robot, command)) is not None:
+        return namesakes
     try:
         return await _ask_until(session, robot, command, timeout_s)
     except (asyncio.CancelledError, DeadlineError):
@@ -318,6 +326,23 @@ async def send_command(session: Session, robot: str, command: RobotCommand, *, t
         _stopping.add(task)
         task.add_done_callback(_stopping.discard)
         raise
+
+
+async def _namesakes(session: Session, robot: str, command: RobotCommand) -> RobotReply | None:
+    """Return the refusal of a command that several robots of one name would carry out; None where there is one."""
+    if command.verb in ("state", "stop"):
+        return None
+    asked = RobotCommand(id=f"{command.id[:150]}~who", verb="state")
+    count = await session.answerers(session.keys.command(robot), encode(asked), timeout_s=_COUNT_S)
+    if count <= 1:
+        return None
+    session.refuse("namesake robot/*/command", robot=robot, answer=count)
+    failure = Failure(
+        code="refused",
+        message=f"{count} robots answer to the name {robot}, and each would do it",
+        remedy="give each a name of its own",
+    )
+    return RobotReply(id=command.id, failure=failure)
 
 
 async def _ask_until(session: Session, robot: str, command: RobotCommand, timeout_s: float) -> RobotReply:

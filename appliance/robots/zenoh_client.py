@@ -22,6 +22,9 @@ FINAL = frozenset({"succeeded", "failed", "cancelled"})
 LOOK_S = 5.0
 """How often a task is looked at while nothing is heard of it: a put may be lost when a gateway dies."""
 
+NAME_S = 12.0
+"""How long a name that another robot has is waited for: one that was cut off is seen to be gone by then."""
+
 Record = dict[str, Any]
 
 
@@ -74,6 +77,7 @@ class ZenohTaskClient:
         verbs: tuple[str, ...] = (),
         flies: bool = False,
         limits: dict[str, float] | None = None,
+        wait_s: float = NAME_S,
     ) -> "Registration":
         """Make the robot known to the fleet, with what it can do; it is there until closed, or until it is cut off.
 
@@ -82,11 +86,15 @@ class ZenohTaskClient:
             verbs: commands that it answers on `robot/{robot}/command` (docs/robots.md).
             flies: whether it does.
             limits: `speed_mps`, `altitude_m`, `payload_kg`, `range_m`, as far as known.
+            wait_s: how long a name that another robot has is waited for.
+
+        Raises:
+            ZenohTaskRejected: another robot has the name (`conflict`).
         """
         info: Record = {"id": self._robot, "kind": "zenoh", "uses": uses, "verbs": verbs, "flies": flies}
         if limits:
             info["limits"] = limits
-        return Registration(self._session, f"{self._root}/robot/{self._robot}", info)
+        return Registration(self._session, f"{self._root}/robot/{self._robot}", info, wait_s=wait_s)
 
     def follow(self, task: str, *, timeout_s: float = 3600.0) -> Iterator[Record]:
         """Yield a task's record whenever it changes, until it ends; TimeoutError when it does not by then."""
@@ -139,10 +147,20 @@ class ZenohTaskClient:
 class Registration:
     """A robot as the fleet knows it: its liveliness token says that it is there, its state what it is and where."""
 
-    def __init__(self, session: Any, key: str, info: Record) -> None:
+    def __init__(self, session: Any, key: str, info: Record, *, wait_s: float = NAME_S) -> None:
         self._session = session
         self._key = f"{key}/state"
-        self._info = info
+        self._info = info | {"speaker": f"{time.time_ns():020d}-{secrets.token_hex(4)}"}
+        until = time.monotonic() + wait_s
+        while any(reply.ok is not None for reply in session.liveliness().get(f"{key}/alive", timeout=LOOK_S)):
+            if time.monotonic() >= until:
+                self.update()  # heeded by no gateway while the other one is there, but seen
+                raise ZenohTaskRejected(
+                    f"there is a robot that calls itself {info['id']}",
+                    code="conflict",
+                    remedy="give each a name of its own",
+                )
+            time.sleep(0.5)
         # Kept here: a token that nobody holds is taken back by the garbage collector.
         self._token: Any = session.liveliness().declare_token(f"{key}/alive")
         self.update()

@@ -110,7 +110,10 @@ class Calls:
             # What the robot and its site allow may have changed meanwhile, and so may where it is.
             sent = self._orders(run.robot, command, CHOSEN - run.params.keys(), begun)
             left = give_up - time.monotonic()
-            reply = await send_command(self._plane.session, run.robot, sent, timeout_s=max(0.1, left))
+            doubtful = self._plane.registry.doubtful(run.robot)
+            reply = await send_command(
+                self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful
+            )
             if reply.failure is None:
                 return _answer(reply)
             if reply.failure.code == "cancelled" and await self._was_stopped(run.robot):

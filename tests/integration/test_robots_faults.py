@@ -2,17 +2,22 @@
 
 import asyncio
 import math
+import sys
 import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from robots_process import BEAT, STATION, beats, gateway_process, open_zenoh, read_frames, swiftbot
 
-from appliance.model import Notice
+from appliance.errors import RefusedError
+from appliance.local_fleet import FleetState
+from appliance.model import Notice, Pose, RobotCommand, RobotInfo, RobotReply, encode
 from appliance.robots.mavlink.dialect import Codec, make
 from appliance.robots.settings import RobotsConfig, Template
+from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskRejected
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 FOREIGN = bytes.fromhex("fd06000000050161ea0001020304fdff2ab4")
@@ -240,3 +245,98 @@ async def test_absurd_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
         finally:
             token.undeclare()
             await asyncio.to_thread(session.close)
+
+
+async def test_a_second_robot_of_a_name_is_refused_and_reported(tmp_path: Path) -> None:
+    """A second `swiftbot sim zenoh` of one name: told to users, its row not flipped, and it takes no command."""
+    async with gateway_process(tmp_path, zenoh=1) as it:
+        await it.until(lambda: "rover_1" in it.robots() and it.robots()["rover_1"].online)
+        notices: asyncio.Queue[Notice] = asyncio.Queue()
+        it.client.on_notice(notices)
+        first = it.robots()["rover_1"].speaker
+        second = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "appliance.cli", "sim", "zenoh", "--name", "rover_1", "--fleet", it.fleet.fleet,
+            "--connect", it.fleet.endpoints[0], stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            await it.until(lambda: "another robot calls itself rover_1" in it.robots()["rover_1"].note)
+            assert "a second robot that calls itself rover_1 is refused" in notices.get_nowait().text
+            order: dict[str, Any] = {"waypoints": [{"x": 10.0, "y": 4.0}], "speed_mps": 2.0}
+            told: list[RobotInfo] = []
+            session, keys = it.client.plane.session, it.client.plane.keys
+            session.subscribe_typed(keys.robot("rover_1"), RobotInfo, lambda _, each: each and told.append(each))
+            lease = await it.client.take_over("rover_1", lease_s=60.0)
+            await it.client.drive(lease, "goto", timeout_s=60.0, **order)
+            await it.client.give_back(lease)
+            await asyncio.sleep(6.0)  # it shows itself again meanwhile
+            moved = {each.speaker for each in told if each.pose is not None and each.pose.x > 9.0}
+            assert moved == {first}
+            assert it.robots()["rover_1"].speaker == first
+            assert it.robots()["rover_1"].pose is not None
+        finally:
+            second.terminate()
+            await second.wait()
+
+
+async def test_no_command_is_carried_out_by_two_that_others_wrote(tmp_path: Path) -> None:
+    """They say nothing of which they are and look at nothing: neither is ordered while both answer."""
+    async with gateway_process(tmp_path) as it:
+        carts = [await asyncio.to_thread(Cart, it.fleet) for _ in range(2)]
+        try:
+            await it.until(lambda: "cart_1" in it.robots(), lambda: [each.tell() for each in carts])
+            lease = await it.client.take_over("cart_1", lease_s=60.0)
+            with pytest.raises(RefusedError, match="2 robots answer to the name cart_1"):
+                await it.client.drive(lease, "goto", waypoints=[{"x": 5.0, "y": 4.0}], speed_mps=1.0)
+            assert not [each for cart in carts for each in cart.told if each.verb == "goto"]
+            await asyncio.to_thread(carts.pop().close)
+            await it.client.drive(lease, "goto", waypoints=[{"x": 5.0, "y": 4.0}], speed_mps=1.0)
+            assert len([each for each in carts[0].told if each.verb == "goto"]) == 1
+        finally:
+            for cart in carts:
+                await asyncio.to_thread(cart.close)
+
+
+async def test_a_client_library_is_refused_a_name_that_is_taken(tmp_path: Path) -> None:
+    """`register` raises, the list says that there was another, and the name is free when the first one is gone."""
+    async with gateway_process(tmp_path) as it:
+        sessions = [await asyncio.to_thread(open_zenoh, it.fleet) for _ in range(2)]
+        one, two = (AsyncZenohTaskClient(each, fleet=it.fleet.fleet, robot="cart_1") for each in sessions)
+        try:
+            mine = await one.register(uses=("base",), verbs=("state", "goto"))
+            with pytest.raises(ZenohTaskRejected, match="there is a robot that calls itself cart_1"):
+                await two.register(wait_s=0.5)
+            await it.until(lambda: "another robot" in it.robots()["cart_1"].note, mine.update)
+            await asyncio.to_thread(mine.close)
+            await two.register(uses=("base",), verbs=("state",), wait_s=20.0)
+        finally:
+            for each in sessions:
+                await asyncio.to_thread(each.close)
+
+
+class Cart:
+    """A robot that others wrote: it does whatever it is told."""
+
+    def __init__(self, fleet: FleetState) -> None:
+        self.told: list[RobotCommand] = []
+        self._session = open_zenoh(fleet)
+        self._key = f"swiftbot/{fleet.fleet}/robot/cart_1"
+        self._token = self._session.liveliness().declare_token(f"{self._key}/alive")
+        self._served = self._session.declare_queryable(f"{self._key}/command", self._do)
+
+    def _do(self, query: Any) -> None:
+        command = msgspec.json.decode(query.payload.to_bytes(), type=RobotCommand)
+        self.told.append(command)
+        query.reply(str(query.key_expr), encode(RobotReply(id=command.id)))
+
+    def tell(self) -> None:
+        """Put its state."""
+        info = RobotInfo(
+            id="cart_1", kind="zenoh", uses=("base",), verbs=("goto", "state", "stop"), pose=Pose(x=4.0, y=4.0)
+        )
+        self._session.put(f"{self._key}/state", encode(info), encoding="application/json")
+
+    def close(self) -> None:
+        """Leave."""
+        self._token.undeclare()
+        self._served.undeclare()
+        self._session.close()

@@ -180,7 +180,8 @@ class Leasing:
         if why := self._refuses(ask.robot, command):
             raise RefusedError(f"{ask.robot} is {why}", remedy="it moves when that is lifted: `swiftbot resume`")
         command = self._orders(ask.robot, command)
-        return await send_command(self._plane.session, ask.robot, command, timeout_s=ask.timeout_s)
+        doubtful = self._plane.registry.doubtful(ask.robot)
+        return await send_command(self._plane.session, ask.robot, command, timeout_s=ask.timeout_s, doubtful=doubtful)
 
     async def _held(self, robot: str, lease: str) -> Lease:
         held = self.leases.of(robot)

@@ -7,7 +7,9 @@ lives as long as its process: a rover that is switched off forgets, and starts a
 
 import asyncio
 import base64
+import contextlib
 import math
+import secrets
 import time
 from contextlib import AsyncExitStack
 
@@ -16,7 +18,7 @@ import structlog
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, UnreachableError
-from appliance.model import Pose, RobotInfo, Site, encode
+from appliance.model import Notice, Pose, RobotInfo, Site, encode
 from appliance.model.geo import blocked_leg
 from appliance.plane.keys import check_name
 from appliance.plane.session import Session
@@ -55,6 +57,9 @@ GRASP_S = 2.0
 SHUTTER_S = 0.3
 USUAL_RECORD_S, USUAL_FPS = 5.0, 5.0
 _RETRY_S = 0.5
+_SEEN_S = 5.0
+"""How often a robot whose name is taken shows that it is there."""
+_OPERATOR = "operator"
 _SNAPSHOT_S = 1.0
 _MAX_HOLD_S = 86_400.0
 _CHARGER_M = 1.0
@@ -120,6 +125,7 @@ class Rover:
         self.home = start_point(settings.site, settings.start)
         self.driving = Driving(*self.home, battery_percent=settings.battery_percent)
         self.refused: dict[str, int] = {}
+        self._speaker = f"{time.time_ns():020d}-{secrets.token_hex(4)}"
         self._site = settings.site
         self._rate = settings.rate
         self._session = session
@@ -158,6 +164,8 @@ class Rover:
             follow = session.subscribe_typed(keys.world(), Thing, self._follow)
             stack.callback(follow.close)
             await self._catch_up()
+            if not await self._named_alone(stop):
+                return
             for closer in (
                 session.serve(keys.world_of(self.name), self._tell_world),
                 session.serve(keys.command(self.name), self.desk.handle),
@@ -170,6 +178,29 @@ class Rover:
             stack.push_async_callback(ears.close)
             log.info("simulated rover", robot=self.name, at=self.home)
             await self._live(stop)
+
+    async def _named_alone(self, stop: asyncio.Event) -> bool:
+        """Wait until no other robot has this one's name, which is told of once; False when it is to stop first."""
+        session, told, seen_at = self._session, False, -math.inf
+        while await session.alive_now(session.keys.robot_alive(self.name)):
+            if not told:
+                told = True
+                log.error("another robot has this name: waiting until it is gone", robot=self.name)
+                notice = Notice(
+                    id=f"{self.name}/namesake/{self._speaker}",
+                    to=_OPERATOR,
+                    text=f"a second robot that calls itself {self.name} is refused: give it a name of its own",
+                    at_ns=time.time_ns(),
+                )
+                session.put(session.keys.notice(_OPERATOR), encode(notice))
+            if time.monotonic() - seen_at >= _SEEN_S:
+                seen_at = time.monotonic()
+                session.put(session.keys.robot(self.name), encode(self.info()))  # heeded by no roster, but seen
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_RETRY_S):
+                    await stop.wait()
+                    return False
+        return True
 
     async def _live(self, stop: asyncio.Event) -> None:
         before = told = 0.0
@@ -205,6 +236,7 @@ class Rover:
             mode=busy[0] if busy else "idle",
             holding=held.name if held else "",
             note=", ".join(busy),
+            speaker=self._speaker,
         )
 
     def _charge(self, dt: float) -> None:

@@ -161,8 +161,8 @@ class Heard:
 
 
 POSITION: dict[str, Any] = {
-    "time_boot_ms": 1, "lat": 473977420, "lon": 85455940, "alt": 500_000, "relative_alt": 5_000, "vx": 100, "vy": 0, "vz": 0,
-    "hdg": 9000,
+    "time_boot_ms": 1, "lat": 473977420, "lon": 85455940, "alt": 500_000, "relative_alt": 5_000, "vx": 100, "vy": 0,
+    "vz": 0, "hdg": 9000,
 }  # fmt: skip
 STATUS: dict[str, Any] = dict.fromkeys(
     (

@@ -191,6 +191,11 @@ class FakeRegistry:
         """Return what the test says; by default nothing was ever heard."""
         return self.ages.get(gateway, math.inf)
 
+    def doubtful(self, robot: str) -> bool:
+        """Return whether more than one may go by that name: none does here."""
+        del robot
+        return False
+
     def keeps_promise(self, gateway: str) -> bool:
         """Return that nobody promised anything."""
         return False

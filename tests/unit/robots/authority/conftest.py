@@ -21,7 +21,7 @@ class FakePlane:
     def __init__(self) -> None:
         self.keys = Keys("f")
         self.session = self.dht = self.store = self
-        self.registry = SimpleNamespace(robots={})
+        self.registry = SimpleNamespace(robots={}, doubtful=lambda _: False)
         self.told: list[str] = []
         self.deaf: set[str] = set()
         self.mad: dict[str, bytes] = {}
