@@ -145,7 +145,7 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     message_hz: float = 500.0
     """Most frames a second of one message from one sender (system and component), with a burst of four seconds' worth:
     what more comes is a storm, as of two programs that answer each other's answers. It is let through in a trickle
-    (4 %) until it is over, counted as `damped`, and told of once. Messages that carry files are excepted.
+    (4 %) until it is over, counted as `damped`, and reported once. Messages that carry files are excepted.
     0: no limit."""
     repeat_s: float = 0.5
     """The same bytes within so long are a repetition, which came by two ways or round a ring of routers, and go no

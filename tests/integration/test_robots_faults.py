@@ -115,8 +115,8 @@ async def test_no_robot_of_senders_that_are_no_vehicle(tmp_path: Path) -> None:
         await it.until(lambda: "drone_7" in it.robots() and it.robots()["drone_7"].online, act)
 
 
-async def test_a_storm_between_two_ends_is_damped_and_told_once(tmp_path: Path) -> None:
-    """Two programs answer each other's PARAM_VALUE through the gateway: it dies down, and users are told of it."""
+async def test_a_storm_between_two_ends_is_damped_and_reported_once(tmp_path: Path) -> None:
+    """Two programs answer each other's PARAM_VALUE through the gateway: it dies down, and users see a notice."""
     async with gateway_process(tmp_path) as it:
         notices: asyncio.Queue[Notice] = asyncio.Queue()
         it.client.on_notice(notices)
@@ -183,17 +183,17 @@ async def test_a_station_that_sends_no_heartbeat_is_served(tmp_path: Path) -> No
             lambda: ground.send(station.pack(asked)),
         )
 
-        def told(name: str) -> list[Any]:
+        def messages(name: str) -> list[Any]:
             heard.extend(read_frames(ground))
             return [each.message for each in heard if each.name == name]
 
         await it.until(
-            lambda: any(each.get_srcSystem() == 1 for each in told("HEARTBEAT")), lambda: vehicle.send(beat())
+            lambda: any(each.get_srcSystem() == 1 for each in messages("HEARTBEAT")), lambda: vehicle.send(beat())
         )
         numbers = {f"param{number}": 0.0 for number in range(2, 8)}
         order = {"target_system": 242, "target_component": 191, "command": 31010, "confirmation": 0, "param1": 1.0}
         ground.send(station.pack(make("COMMAND_LONG", **order, **numbers)))
-        await it.until(lambda: any(each.result == 0 for each in told("COMMAND_ACK")))
+        await it.until(lambda: any(each.result == 0 for each in messages("COMMAND_ACK")))
         assert len((await it.client.tasks(100)).tasks) == 1
         assert set(it.robots()) == {"drone_1"}
         lists, _ = await it.client.robot_links(it.gateway)
@@ -248,7 +248,7 @@ async def test_absurd_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
 
 
 async def test_a_second_robot_of_a_name_is_refused_and_reported(tmp_path: Path) -> None:
-    """A second `swiftbot sim zenoh` of one name: told to users, its row not flipped, and it takes no command."""
+    """A second `swiftbot sim zenoh` of one name: users see it, its row not flipped, and it takes no command."""
     async with gateway_process(tmp_path, zenoh=1) as it:
         await it.until(lambda: "rover_1" in it.robots() and it.robots()["rover_1"].online)
         notices: asyncio.Queue[Notice] = asyncio.Queue()
@@ -262,14 +262,14 @@ async def test_a_second_robot_of_a_name_is_refused_and_reported(tmp_path: Path) 
             await it.until(lambda: "another robot calls itself rover_1" in it.robots()["rover_1"].note)
             assert "a second robot that calls itself rover_1 is refused" in notices.get_nowait().text
             order: dict[str, Any] = {"waypoints": [{"x": 10.0, "y": 4.0}], "speed_mps": 2.0}
-            told: list[RobotInfo] = []
+            states: list[RobotInfo] = []
             session, keys = it.client.plane.session, it.client.plane.keys
-            session.subscribe_typed(keys.robot("rover_1"), RobotInfo, lambda _, each: each and told.append(each))
+            session.subscribe_typed(keys.robot("rover_1"), RobotInfo, lambda _, each: each and states.append(each))
             lease = await it.client.take_over("rover_1", lease_s=60.0)
             await it.client.drive(lease, "goto", timeout_s=60.0, **order)
             await it.client.give_back(lease)
             await asyncio.sleep(6.0)  # it shows itself again meanwhile
-            moved = {each.speaker for each in told if each.pose is not None and each.pose.x > 9.0}
+            moved = {each.speaker for each in states if each.pose is not None and each.pose.x > 9.0}
             assert moved == {first}
             assert it.robots()["rover_1"].speaker == first
             assert it.robots()["rover_1"].pose is not None
@@ -287,10 +287,10 @@ async def test_no_command_is_carried_out_by_two_that_others_wrote(tmp_path: Path
             lease = await it.client.take_over("cart_1", lease_s=60.0)
             with pytest.raises(RefusedError, match="2 robots answer to the name cart_1"):
                 await it.client.drive(lease, "goto", waypoints=[{"x": 5.0, "y": 4.0}], speed_mps=1.0)
-            assert not [each for cart in carts for each in cart.told if each.verb == "goto"]
+            assert not [each for cart in carts for each in cart.ordered if each.verb == "goto"]
             await asyncio.to_thread(carts.pop().close)
             await it.client.drive(lease, "goto", waypoints=[{"x": 5.0, "y": 4.0}], speed_mps=1.0)
-            assert len([each for each in carts[0].told if each.verb == "goto"]) == 1
+            assert len([each for each in carts[0].ordered if each.verb == "goto"]) == 1
         finally:
             for cart in carts:
                 await asyncio.to_thread(cart.close)
@@ -314,10 +314,10 @@ async def test_a_client_library_is_refused_a_name_that_is_taken(tmp_path: Path) 
 
 
 class Cart:
-    """A robot that others wrote: it does whatever it is told."""
+    """A robot that others wrote: it does all that it is ordered."""
 
     def __init__(self, fleet: FleetState) -> None:
-        self.told: list[RobotCommand] = []
+        self.ordered: list[RobotCommand] = []
         self._session = open_zenoh(fleet)
         self._key = f"swiftbot/{fleet.fleet}/robot/cart_1"
         self._token = self._session.liveliness().declare_token(f"{self._key}/alive")
@@ -325,7 +325,7 @@ class Cart:
 
     def _do(self, query: Any) -> None:
         command = msgspec.json.decode(query.payload.to_bytes(), type=RobotCommand)
-        self.told.append(command)
+        self.ordered.append(command)
         query.reply(str(query.key_expr), encode(RobotReply(id=command.id)))
 
     def tell(self) -> None:

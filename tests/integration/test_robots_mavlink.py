@@ -351,7 +351,7 @@ async def test_bad_frames_are_counted_and_the_stream_goes_on(open_yard: Open) ->
     await until(lambda: "drone_60" in yard.hub.attached)
     for kind in ("noise", "checksum", "unknown_message", "truncated", "address_conflict"):
         assert yard.hub.refused[kind] == 1
-    assert "unknown_system" not in yard.hub.refused  # what spoke before it had told what it is, and the station
+    assert "unknown_system" not in yard.hub.refused  # what spoke before its first heartbeat, and the station
     assert yard.hub.attached == ("drone_1", "drone_60")
     await yard.done("arm")
 

@@ -1,4 +1,4 @@
-"""Storms of one message: found by its rate, let through in a trickle, told of once. Pure, the clock passed in.
+"""Storms of one message: found by its rate, let through in a trickle, reported once. Pure, the clock passed in.
 
 Two programs that answer each other's answers never end, and each further one doubles what is sent: three vehicles that
 took PARAM_VALUE for a question sent 45,000 a second. A gateway cannot tell such a message from one that is wanted, but
@@ -38,7 +38,7 @@ class _Flow(Struct):
     level: float
     at: float
     damped: bool = False
-    told: bool = False
+    reported: bool = False
     since: float = 0.0
     came: int = 0
 
@@ -88,17 +88,17 @@ class Damper:
         if passed < WINDOW_S:
             return
         if flow.came / passed < self._per_s * TRICKLE:
-            flow.damped, flow.told = False, False
+            flow.damped, flow.reported = False, False
             flow.level = self._per_s * BURST_S
             self.damped.pop(kind, None)
         flow.since, flow.came = now, 0
 
     def news(self, kind: Kind) -> bool:
-        """Whether a storm is one that was not told of; notes that it is now."""
+        """Whether a storm is one that was not reported; notes that it is now."""
         flow = self._flows.get(kind)
-        if flow is None or flow.told:
+        if flow is None or flow.reported:
             return False
-        flow.told = True
+        flow.reported = True
         return True
 
     def look(self, now: float) -> None:

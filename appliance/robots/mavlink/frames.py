@@ -44,7 +44,7 @@ class Damage(Struct, frozen=True):
     """Bytes that made no frame, or one that is not believed.
 
     `checksum`, `unknown_message`, `truncated`, `incompatible`, `noise`; `signed` (there is no key here), `unsigned`,
-    `bad_signature`, `replayed`. Damage is told when it is seen, and its bytes, where they are not sure to be lost
+    `bad_signature`, `replayed`. Damage is reported when it is seen, and its bytes, where they are not sure to be lost
     then, behind it (`counted` is false): the two are one damage.
     """
 

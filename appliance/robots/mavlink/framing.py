@@ -111,9 +111,9 @@ class Reader:
             first = ()
             if inside:
                 flags = data[here] == MARKER_V2 and data[here + 2] & ~SIGNED_FLAG
-                first = self._told("incompatible" if flags else "truncated", here)
+                first = self._report("incompatible" if flags else "truncated", here)
             elif not self._ends:
-                first = self._told("noise", here)
+                first = self._report("noise", here)
             self._lose()
             return first
         if len(self._ends) > 1 and self._marks(here):
@@ -122,7 +122,7 @@ class Reader:
             found = check(data[here:whole])
             if isinstance(found, Damage):
                 self._ends.append(whole)
-                return self._told(found.kind, whole)
+                return self._report(found.kind, whole)
             gone = self._gone(here)
             self._at, self._ends = whole, []
             return (*gone, self._judged(found))
@@ -131,7 +131,7 @@ class Reader:
         if here == len(data):
             self._ends = []
             return self._gone(here)
-        first = self._told("truncated", here)
+        first = self._report("truncated", here)
         self._lose()
         return first
 
@@ -193,7 +193,7 @@ class Reader:
         self._ends = self._ends[-1:]
         return gone
 
-    def _told(self, kind: str, upto: int) -> tuple[Damage, ...]:
+    def _report(self, kind: str, upto: int) -> tuple[Damage, ...]:
         self._kind, self._quiet = kind, upto + LONGEST
         return (Damage(kind, 0),)
 
@@ -202,7 +202,7 @@ class Reader:
         length, self._at = to - self._at, to
         found = [Damage(self._kind, length, counted=False)] if length else []
         while to > self._quiet:
-            found += self._told("noise", self._quiet)
+            found += self._report("noise", self._quiet)
         return tuple(found)
 
     def _marks(self, at: int) -> bool:

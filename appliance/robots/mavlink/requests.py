@@ -15,7 +15,7 @@ asked for last (for ground stations whose buttons can send commands only). COMMA
 sender has one outstanding; a repetition of the last one gets the last answer, also from a gateway that was restarted in
 between. A repetition is the same command, byte for byte, with `confirmation` above 0; COMMAND_INT has no such field, so
 there it is what comes within `REPEAT_S` of the answer. While the first is being handed in the answer to either is
-IN_PROGRESS. How the task goes on is told by STATUSTEXT (`progress`).
+IN_PROGRESS. How the task goes on is reported by STATUSTEXT (`progress`).
 """
 
 import asyncio

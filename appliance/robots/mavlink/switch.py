@@ -30,7 +30,7 @@ from appliance.robots.settings import RobotsConfig
 log = structlog.get_logger(__name__)
 
 OPERATORS = "operator"
-"""Who is told of what goes wrong on links."""
+"""Who gets notices of what goes wrong on links."""
 FRAME_ENCODING = "application/mavlink"
 _LINKS_S = 1.0
 """How often the links are told about."""
@@ -142,7 +142,7 @@ class Switch:
             entry.link.count("damped")
             entry.link.stats.sender(*source).hear(frame.sequence, now)
             if entry.damper.news(kind):
-                self._tell_storm(entry, kind)
+                self._report_storm(entry, kind)
             return  # not recorded either: a storm must not fill the log
         if self.router.repeated(frame.raw, now, sender=source):
             entry.link.stats.sender(*source).repeated += 1
@@ -152,7 +152,7 @@ class Switch:
         entry.link.stats.sender(*source).hear(frame.sequence, now)
         self._on_frame(entry, frame, end, now)
 
-    def _tell_storm(self, entry: OpenLink, kind: Kind) -> None:
+    def _report_storm(self, entry: OpenLink, kind: Kind) -> None:
         system, component, name = kind
         link = str(entry.setting.remote)
         log.warning("a MAVLink message comes in a storm and is damped", link=link, message=name, system=system)

@@ -94,7 +94,7 @@ class Vehicle:
     ) -> None:
         self.name = name
         self._implausible = implausible
-        """Told each value that cannot be, by its field's name."""
+        """Called with the name of each field whose value cannot be."""
         self.own = own
         """System id that the gateway speaks as, so that answers to others are told from those to it; 0: not told."""
         self.site = site

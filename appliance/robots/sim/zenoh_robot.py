@@ -180,11 +180,11 @@ class Rover:
             await self._live(stop)
 
     async def _named_alone(self, stop: asyncio.Event) -> bool:
-        """Wait until no other robot has this one's name, which is told of once; False when it is to stop first."""
-        session, told, seen_at = self._session, False, -math.inf
+        """Wait until no other robot has this one's name, which is reported once; False when it is to stop first."""
+        session, reported, seen_at = self._session, False, -math.inf
         while await session.alive_now(session.keys.robot_alive(self.name)):
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 log.error("another robot has this name: waiting until it is gone", robot=self.name)
                 notice = Notice(
                     id=f"{self.name}/namesake/{self._speaker}",

@@ -48,14 +48,14 @@ def read(*pieces: bytes, end: bool = False) -> tuple[list[bytes], Counter[str]]:
 
 @pytest.mark.parametrize("foreign", [HELD_LONG, HELD_LAST], ids=["within", "last byte"])
 def test_frames_behind_a_foreign_one_are_read_when_they_come(foreign: bytes) -> None:
-    """Each heartbeat is told with its last byte, and the foreign frame is counted, once, with its own."""
+    """Each heartbeat is found with its last byte, and the foreign frame is counted, once, with its own."""
     stream = Stream(Codec(245, 191))
     assert [each.kind for each in stream.feed(foreign) if isinstance(each, Damage)] == ["unknown_message"]
     for beat in beats(20):
         assert not [each for each in stream.feed(beat[:-1]) if isinstance(each, Frame)]
-        told = list(stream.feed(beat[-1:]))
-        assert [each.raw for each in told if isinstance(each, Frame)] == [beat]
-        assert not [each for each in told if isinstance(each, Damage) and each.counted]
+        frames_now = list(stream.feed(beat[-1:]))
+        assert [each.raw for each in frames_now if isinstance(each, Frame)] == [beat]
+        assert not [each for each in frames_now if isinstance(each, Damage) and each.counted]
 
 
 @pytest.mark.parametrize("place", range(21))
@@ -74,9 +74,9 @@ def test_one_damaged_byte_holds_no_heartbeat_back(place: int, value: int, size: 
     assert counted.total() == 1, counted
     stream = Stream(Codec(245, 191))
     list(stream.feed(bytes(damaged)))
-    told = [len([each for each in stream.feed(other) if isinstance(each, Frame)]) for other in others]
-    assert told[:2] in ([1, 1], [0, 2]), "one that the damaged bytes cover comes with the next"
-    assert set(told[2:]) == {1}
+    frames_now = [len([each for each in stream.feed(other) if isinstance(each, Frame)]) for other in others]
+    assert frames_now[:2] in ([1, 1], [0, 2]), "one that the damaged bytes cover comes with the next"
+    assert set(frames_now[2:]) == {1}
 
 
 def test_two_damaged_frames_in_a_row_hold_nothing_back() -> None:
@@ -178,7 +178,7 @@ def test_any_cut_of_a_stream_tells_the_same(whole: bytes, cuts: list[int]) -> No
         seen.append(piece)
         frames, now = read(b"".join(seen))
         assert (frames, now) == read(*seen)
-        assert not counted - now, "what was told is not taken back"
+        assert not counted - now, "what was reported is not taken back"
         counted = now
 
 
@@ -206,7 +206,7 @@ def test_whatever_pymavlink_finds_is_found(whole: bytes, size: int) -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(_FRAMES), st.integers(3, 200), st.integers(0, 255)), max_size=12))
-def test_a_good_frame_is_told_with_its_last_byte(sent: list[tuple[bytes, int, int]]) -> None:
+def test_a_good_frame_is_found_with_its_last_byte(sent: list[tuple[bytes, int, int]]) -> None:
     """Whatever the bodies of those before it have become: lengths are right, so nothing else is waited for."""
     stream = Stream(Codec(245, 191))
     for raw, place, value in sent:
@@ -216,6 +216,6 @@ def test_a_good_frame_is_told_with_its_last_byte(sent: list[tuple[bytes, int, in
         if raw[0] == 0xFE and damaged[5] != raw[5]:
             damaged[5] = 0xB4  # of another dialect
         found = [each for at in range(len(raw)) for each in stream.feed(bytes(damaged[at : at + 1]))]
-        told = [each.raw for each in found if isinstance(each, Frame)]
+        frames_now = [each.raw for each in found if isinstance(each, Frame)]
         counted = [each for each in found if isinstance(each, Damage) and each.counted]
-        assert (told, len(counted)) == (([raw], 0) if bytes(damaged) == raw else ([], 1))
+        assert (frames_now, len(counted)) == (([raw], 0) if bytes(damaged) == raw else ([], 1))

@@ -103,7 +103,7 @@ async def test_who_takes_a_vehicles_address_is_not_learned() -> None:
 
 
 async def test_vehicles_that_may_not_be_robots_are_not_routed() -> None:
-    """A link that accepts no further vehicles does not pass on what they say once they have told what they are."""
+    """A link that accepts no further vehicles does not pass on what they say once they have said what they are."""
     port = free_port(socket.SOCK_DGRAM)
     async with station(port, max_vehicles=1) as (made, refused), sender(port) as send:
         one, two = Codec(1, 1), Codec(2, 1)

@@ -32,7 +32,7 @@ def test_simulated_vehicles_do_not_answer_answers(kinds: tuple[Any, ...]) -> Non
     vehicles = [kind(system=number + 1, site=Site(), home=(0.0, 0.0)) for number, kind in enumerate(kinds)]
     asked = make("PARAM_REQUEST_LIST", target_system=0, target_component=0)
     heard = [frame_of(asked, 255, 190)]
-    told = 0
+    sent = 0
     for tick in range(40):
         now = tick / 10
         said: list[Frame] = []
@@ -40,9 +40,9 @@ def test_simulated_vehicles_do_not_answer_answers(kinds: tuple[Any, ...]) -> Non
             answers = [each for frame in heard if frame.system != vehicle.system for each in vehicle.handle(frame, now)]
             answers += vehicle.parameters.step()
             said += [frame_of(each, vehicle.system) for each in answers if each.get_type() == "PARAM_VALUE"]
-        told += len(said)
+        sent += len(said)
         heard = said
-    assert told == sum(len(each.parameters.values) for each in vehicles)
+    assert sent == sum(len(each.parameters.values) for each in vehicles)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_what_is_usual_passes() -> None:
     assert not damper.damped
 
 
-def test_a_storm_is_cut_to_a_trickle_and_told_once() -> None:
+def test_a_storm_is_cut_to_a_trickle_and_reported_once() -> None:
     """Of 15,000 a second so many pass as may come at once, then 4 % of the limit; other messages are not concerned."""
     damper = Damper(500.0)
     passed = _run(damper, 15_000.0, 20.0)
@@ -91,7 +91,7 @@ def test_a_storm_is_cut_to_a_trickle_and_told_once() -> None:
 
 
 def test_a_storm_that_is_over_is_forgotten() -> None:
-    """What comes seldom passes whole again, what is silent too; a second storm is told of again."""
+    """What comes seldom passes whole again, what is silent too; a second storm is reported again."""
     damper = Damper(500.0)
     for start, silent in ((0.0, False), (100.0, True)):
         _run(damper, 5000.0, 3.0, start=start)
