@@ -19,6 +19,7 @@ import structlog
 
 from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError, SwiftbotError
 from appliance.llm.analysis import Analysis, analyse
+from appliance.llm.checks.reading import with_names
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.completion import completed
 from appliance.llm.experience.memory import Memory
@@ -205,10 +206,13 @@ class Decomposer:
             raise stop_refused(stop)
 
         def judge(plan: Plan, confidence: float, run_from: float) -> tuple[Plan, Review]:
-            whole = completed(plan, context, self._catalogue)
-            return whole, self._review(whole, context, confidence=confidence, run_from=run_from)
+            whole, added = completed(plan, context, self._catalogue)
+            found = self._review(whole, context, confidence=confidence, run_from=run_from, added=added)
+            return whole, found
 
-        return await self._turn(context, judge)
+        # Planners are told of robots by name; the review goes by the words as they were typed.
+        named = with_names(context.instruction, context.robots)
+        return await self._turn(msgspec.structs.replace(context, instruction=named), judge)
 
     async def replan(
         self,
@@ -246,8 +250,8 @@ class Decomposer:
                     wrong = (*wrong, error.message, *error.problems)
                 else:
                     found = self._review(part, context, confidence=confidence, run_from=run_from)
-                    return plan, Review(findings=(*map(_refusal, wrong), *found.findings))
-            return plan, Review(findings=tuple(map(_refusal, wrong)))
+                    return plan, msgspec.structs.replace(found, findings=(*map(_refusal, wrong), *found.findings))
+            return plan, Review(findings=tuple(map(_refusal, wrong)), confidence=confidence)
 
         return await self._turn(context, judge)
 
@@ -371,8 +375,8 @@ class Decomposer:
             )
 
         def judged(proposal: Proposal) -> tuple[float, Plan, Review]:
-            confidence = round(min(1.0, max(0.0, proposal.confidence)), 4)
-            return confidence, *judge(proposal.plan, confidence, least)
+            plan, found = judge(proposal.plan, round(min(1.0, max(0.0, proposal.confidence)), 4), least)
+            return found.confidence, plan, found
 
         try:
             async with _deadline(slot.deadline_s, tier):
@@ -413,7 +417,15 @@ class Decomposer:
             return f"not asked: {words} words are more than the {slot.max_words} it is good at"
         return ""
 
-    def _review(self, plan: Plan, context: PlanContext, *, confidence: float, run_from: float) -> Review:
+    def _review(
+        self,
+        plan: Plan,
+        context: PlanContext,
+        *,
+        confidence: float,
+        run_from: float,
+        added: frozenset[str] = frozenset(),
+    ) -> Review:
         return review(
             Facts(
                 plan,
@@ -423,6 +435,7 @@ class Decomposer:
                 require_implemented=self._config.require_implemented,
                 confidence=confidence,
                 run_from=run_from,
+                added=added,
             )
         )
 
@@ -438,7 +451,7 @@ class _Candidate(msgspec.Struct, frozen=True, kw_only=True):
     def rank(self) -> tuple[bool, int, float]:
         """Order of preference, the best first: what is no mere guess, what fewer checks hold, what is surer."""
         others = sum(each.check != "confidence" for each in self.review.findings if each.severity is Severity.HOLD)
-        return self.proposal.confidence < _GUESS, others, -self.proposal.confidence
+        return self.review.confidence < _GUESS, others, -self.review.confidence
 
     def found(self, attempts: Sequence[TierAttempt]) -> "_Found":
         attempt = attempts[self.index]

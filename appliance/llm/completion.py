@@ -10,7 +10,7 @@ from appliance.llm.checks.finding import Facts
 from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.robots import candidates
 from appliance.llm.checks.schema import is_unnamed
-from appliance.llm.checks.things import away
+from appliance.llm.checks.things import away, sent_elsewhere
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import PlanContext
 from appliance.model import Plan, Subtask
@@ -19,8 +19,10 @@ from appliance.skills.catalogue import Catalogue
 _POLICY = SafetyConfig()
 
 
-def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> Plan:
-    """Return a plan with what the site and the roster leave no choice of; one that is not valid is returned as it is.
+def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> tuple[Plan, frozenset[str]]:
+    """Return a plan with what the site and the roster leave no choice of, and the ids of the ways that were added.
+
+    One that is not valid is returned as it is.
 
     Args:
         plan: as a planner proposed it.
@@ -28,7 +30,7 @@ def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> Plan:
         catalogue: the skills there are.
     """
     if len({each.id for each in plan.subtasks}) != len(plan.subtasks) or len(plan.subtasks) > 63:
-        return plan
+        return plan, frozenset()
     facts = Facts(plan, context, catalogue, _POLICY)
     bound = _bound(facts)
     if bound is not plan:
@@ -54,30 +56,43 @@ def _bound(facts: Facts) -> Plan:
     return replace(facts.plan, subtasks=subtasks)
 
 
-def _with_ways(facts: Facts) -> Plan:
-    """Send a robot to a thing that it takes, where the site knows the thing to be elsewhere."""
+def _with_ways(facts: Facts) -> tuple[Plan, frozenset[str]]:
+    """Send a robot to where it takes or puts down a thing, where the plan sends it nowhere for that."""
+    none = facts.plan, frozenset[str]()
     if facts.site is None or "goto" not in facts.catalogue.skills:
-        return facts.plan
-    subtasks: list[Subtask] = []
-    added = False
-    taken = {each.id for each in facts.plan.subtasks}
-    for subtask in facts.plan.subtasks:
-        where = away(facts, subtask)
-        if where is None:
-            subtasks.append(subtask)
-            continue
-        number = next(n for n in range(1, 200) if f"way{n}" not in taken)
-        taken.add(f"way{number}")
+        return none
+    ways: dict[str, Subtask] = {}
+    while len(ways) < 16:
+        missing = next((each for each in facts.plan.subtasks if _needs_way(facts, each)), None)
+        if missing is None:
+            break
         way = Subtask(
-            id=f"way{number}", skill="goto", robot=subtask.robot, params={"place": where}, after=subtask.after
-        )
-        subtasks += [way, replace(subtask, after=(way.id,))]
-        added = True
-    if not added:
-        return facts.plan
-    names = {each.id: f"s{number}" for number, each in enumerate(subtasks, start=1)}
+            id=f"way{len(ways) + 1}", skill="goto", robot=missing.robot, params={"place": away(facts, missing)},
+            after=missing.after,
+        )  # fmt: skip
+        ways[way.id] = way
+        subtasks = [
+            new
+            for each in facts.plan.subtasks
+            for new in ((way, replace(each, after=(way.id,))) if each is missing else (each,))
+        ]
+        facts = Facts(replace(facts.plan, subtasks=tuple(subtasks)), facts.context, facts.catalogue, _POLICY)
+    if not ways:
+        return none
+    names = {each.id: f"s{number}" for number, each in enumerate(facts.plan.subtasks, start=1)}
     renamed = tuple(
         replace(each, id=names[each.id], after=tuple(names.get(other, other) for other in each.after))
-        for each in subtasks
+        for each in facts.plan.subtasks
     )
-    return replace(facts.plan, subtasks=renamed)
+    return replace(facts.plan, subtasks=renamed), frozenset(names[each] for each in ways)
+
+
+def _needs_way(facts: Facts, subtask: Subtask) -> bool:
+    """Whether a way has to be added before a subtask: a thing is taken where it is known to be, or put down elsewhere.
+
+    A robot that the words send somewhere and that is then to take a thing from another place is left to a person.
+    """
+    if away(facts, subtask) is None:
+        return False
+    manifest = facts.manifest(subtask)
+    return manifest is not None and ("load" in manifest.frees or not sent_elsewhere(facts, subtask))

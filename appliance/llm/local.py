@@ -49,7 +49,7 @@ _FAR = 0.05
 """Times the confidence of such a plan, which another one must have at least that is to be taken instead."""
 _ODD = 0.5
 """The same for a plan that only leaves a word over."""
-_TELLING = frozenset(("idle_robot", "quantity", "sequence", "assignment", "negation", "repeated"))
+_TELLING = frozenset(("idle_robot", "quantity", "sequence", "assignment", "negation", "repeated", "unnamed_robot"))
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (

@@ -6,7 +6,7 @@ run. No check can take back what another found, so the order of the list only or
 wrote or edited, checks of the words give notes: what they typed is the plan.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from msgspec import Struct
@@ -36,6 +36,8 @@ class Review(Struct, frozen=True, kw_only=True):
     """What the checks found of one plan."""
 
     findings: tuple[Finding, ...] = ()
+    confidence: float = 1.0
+    """How sure the plan is, on the one scale of all tiers."""
 
     @property
     def decision(self) -> Verdict:
@@ -76,7 +78,23 @@ def review(facts: Facts) -> Review:
         formed = formed and not (check.name == "schema" and found)
         if len(found) >= MAX_PROBLEMS:
             break
-    return Review(findings=tuple(found[:MAX_PROBLEMS]))
+    sure = _accounted(facts, found)
+    if sure < facts.run_from and not facts.edited:
+        text = f"the planner is {sure:.2f} sure, and plans run unasked from {facts.run_from:.2f}"
+        found = [*found[: MAX_PROBLEMS - 1], Finding(check="confidence", severity=Severity.HOLD, message=text)]
+    return Review(findings=tuple(found[:MAX_PROBLEMS]), confidence=sure)
+
+
+ACCOUNTED = 0.55
+"""What a plan that accounts for every word is sure of beside its planner: of the open half of the cases of `swiftbot bench
+intent` 62 of 72 such plans were right whose planner was 0.1 to 0.6 sure, and 119 of 123 of those above."""
+
+
+def _accounted(facts: Facts, found: Sequence[Finding]) -> float:
+    """How sure a plan is, on the one scale of all tiers: its planner's probability, and that all words are accounted for."""
+    if facts.continued or any(each.severity is not Severity.NOTE and each.check not in INTRINSIC for each in found):
+        return facts.confidence
+    return round(ACCOUNTED + (1 - ACCOUNTED) * facts.confidence, 4)
 
 
 def _refusing(name: str, problems: Callable[[Facts], Iterable[str]]) -> Callable[[Facts], Iterable[Finding]]:
@@ -98,7 +116,7 @@ def _policy(facts: Facts) -> Iterable[str]:
 
 
 def _grounding(facts: Facts) -> Iterable[str]:
-    return ungrounded(facts.plan, facts.context) if facts.safety.grounded else ()
+    return ungrounded(facts.plan, facts.context, facts.added) if facts.safety.grounded else ()
 
 
 def _consistency(facts: Facts) -> Iterable[Finding]:
@@ -109,16 +127,8 @@ def _consistency(facts: Facts) -> Iterable[Finding]:
         domain=facts.plan.domain,
         subtasks=facts.plan.subtasks,
     )
-    for text in consistency.problems(meaning, facts.catalogue):
+    for text in consistency.problems(meaning, facts.catalogue, style=False):
         yield Finding(check="consistency", severity=Severity.HOLD, message=text)
-
-
-def _confidence(facts: Facts) -> Iterable[Finding]:
-    if facts.confidence < facts.run_from:
-        yield Finding(
-            check="confidence", severity=Severity.HOLD,
-            message=f"the planner is {facts.confidence:.2f} sure, and plans run unasked from {facts.run_from:.2f}",
-        )  # fmt: skip
 
 
 CHECKS: tuple[Check, ...] = (
@@ -134,25 +144,28 @@ CHECKS: tuple[Check, ...] = (
     Check("correction", wording.correction, words=True),
     Check("question", wording.question, words=True),
     Check("pronoun", wording.pronoun, words=True),
+    Check("names", wording.names, words=True),
     Check("quantity", wording.quantity, words=True),
     Check("polarity", wording.polarity, words=True),
+    Check("delivery", wording.delivery, words=True),
     Check("coverage", wording.coverage, words=True),
     Check("sequence", wording.sequence, words=True),
     Check("repeated", wording.repeated, words=True),
     Check("unseen", wording.unseen, words=True),
     Check("unnamed_robot", robots.unnamed_robot, words=True),
+    Check("choose_robot", robots.choose_robot, words=True),
     Check("idle_robot", robots.idle_robot, words=True),
     Check("assignment", robots.assignment, words=True),
+    Check("assignment", robots.each_of_group, words=True),
     Check("elsewhere", things.elsewhere),
     Check("unknown_thing", things.unknown_thing, words=True),
     Check("consistency", _consistency, words=True),
-    Check("confidence", _confidence, words=True),
     Check("approval", policy_holds),
 )
 """In the order in which their findings are listed."""
 _OF_ANY_FORM = frozenset(("schema", "contradiction", "consistency", "approval"))
 """Checks that survive any plan that decodes."""
-_OF_A_REST = frozenset(("grounding", "confidence"))
+_OF_A_REST = frozenset(("grounding",))
 """Checks of the words that hold for the rest of a task, too."""
-INTRINSIC = frozenset(("unnamed_robot", "approval", "unseen"))
+INTRINSIC = frozenset(("choose_robot", "approval", "unseen", "elsewhere"))
 """Checks whose findings another plan for the same words would have too: no further planner is asked."""

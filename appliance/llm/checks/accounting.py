@@ -13,6 +13,7 @@ from functools import lru_cache
 from msgspec import Struct
 
 from appliance.llm.checks import lexicon as lx
+from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import Reading, Token, stem
 from appliance.llm.language.values import FREE, figures, quantity, unit_of
 from appliance.model import Plan, Site, Subtask
@@ -24,7 +25,7 @@ ARTICLES = frozenset(
 _GAP = 5
 """Tokens that may stand between a verb and its particle: "pick the big red box up"."""
 _PARTICLES = frozenset(
-    ("up", "down", "on", "off", "out", "back", "away", "over", "in", "together", "around", "for", "to", "at")
+    ("up", "down", "on", "off", "out", "back", "away", "over", "in", "together", "around", "for", "to", "at", "know")
 )
 _IRREGULAR = {
     "go": ("goes", "going", "gone"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
@@ -52,6 +53,10 @@ _PARAM_WORDS = {
 }  # fmt: skip
 """Words that come with a parameter and say nothing else."""
 _BLANK = frozenset((",", "-", "–", "(", ")", "and", ":", "="))
+
+
+_WAITED = frozenset(("until", "till", "once", "when", "after", "if", "that", "for"))
+"""Words before what is waited for."""
 
 
 class Claim(Struct, frozen=True):
@@ -95,12 +100,21 @@ def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | Non
             if name == "robots":
                 continue
             said = _said(reading, name, value, site)
+            if said and name not in FREE and not isinstance(value, int | float):
+                # A name that swallows "unless" or "then" has not accounted for it.
+                said = {index for index in said if reading.tokens[index].text not in lx.GUARDS}
             if said:
                 found.values[subtask.id] |= said
                 found.covered |= said
             elif said is None:
                 found.unsaid.append((subtask.id, name, str(value)))
     _phrases(reading, plan, catalogue, found)
+    for subtask in plan.subtasks:
+        # "until Eva confirms", "when the doorbell rings": what is waited for follows the word that says so.
+        first = min(found.values[subtask.id], default=0)
+        if "event" in subtask.params and first and reading.tokens[first - 1].text in _WAITED:
+            found.called[subtask.id].add(first - 1)
+            found.covered.add(first - 1)
     for subtask in plan.subtasks:
         found.evidence[subtask.id] = found.called[subtask.id] | found.values[subtask.id]
     for subtask in plan.subtasks:
@@ -152,14 +166,15 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
     at = 0
     while at < len(tokens):
         best = 0
-        if _starts_quantity(tokens[at]):
+        # "-1 m/s" is no 1 m/s.
+        if _starts_quantity(tokens[at]) and (tokens[at].value or 0) >= 0:
             for length in range(1, 8):
                 window = tokens[at : at + length]
                 if len(window) < length or any(
                     each.kind in ("quote", "robot") or each.text in _ENDS for each in window
                 ):
                     break
-                if not _ends_quantity(window[-1]):
+                if not (_ends_quantity(window[-1]) if unit else _ends_number(window[-1])):
                     continue
                 said = quantity(reading.text[window[0].start : window[-1].end], unit)
                 if said is not None and abs(float(said) - value) <= 1e-3 * max(1.0, abs(value)):
@@ -171,6 +186,10 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
 
 
 _ENDS = frozenset((";", "?", "!", "\n", ","))
+
+
+def _ends_number(token: Token) -> bool:
+    return _starts_quantity(token) or token.text in ("times", "time")
 
 
 def _ends_quantity(token: Token) -> bool:
@@ -192,8 +211,11 @@ def free_said(reading: Reading, text: str) -> set[int] | None:
     for number, token in enumerate(reading.tokens):
         if token.kind == "quote" and re.findall(r"\w+", token.text) == wanted:
             return {number}
+    # What stands in quotation marks is one text: no part of it is taken together with words outside.
     flat: list[tuple[str, int]] = [
-        (word, number) for number, token in enumerate(reading.tokens) for word in re.findall(r"\w+", token.text)
+        (word, number)
+        for number, token in enumerate(reading.tokens)
+        for word in (re.findall(r"\w+", token.text) if token.kind != "quote" else ("\0",))
     ]
     text_words = [word for word, _ in flat]
     for start in range(len(flat) - len(wanted) + 1):
@@ -204,6 +226,8 @@ def free_said(reading: Reading, text: str) -> set[int] | None:
 
 def text_said(reading: Reading, text: str, site: Site | None = None) -> set[int] | None:
     """Return the tokens that say a name or coordinate, all of its mentions; None when they do not."""
+    if coordinate(text) is not None:
+        return _point_said(reading, text)
     names = [text]
     place = site.find(text) if site is not None else None
     if site is not None and place is not None:
@@ -215,6 +239,30 @@ def text_said(reading: Reading, text: str, site: Site | None = None) -> set[int]
     if found:
         return found
     return _scattered(reading, _words(text))
+
+
+def _point_said(reading: Reading, text: str) -> set[int] | None:
+    """The tokens of a coordinate: its numbers one after the other, with nothing but marks and units between."""
+    wanted = [float(each.replace("−", "-")) for each in re.findall(r"[-−]?\d+(?:\.\d+)?", text)]
+    tokens = reading.tokens
+    for start in range(len(tokens)):
+        index, run = start, list[int]()
+        for number in wanted:
+            while run and index < len(tokens) and (tokens[index].text in _BLANK or tokens[index].text in _AXES):
+                run.append(index)
+                index += 1
+            if index >= len(tokens) or tokens[index].kind != "number" or tokens[index].value != number:
+                run = []
+                break
+            run.append(index)
+            index += 1
+        if run:
+            return set(run)
+    return None
+
+
+_AXES = frozenset(("x", "y", "z", "m", "metres", "meters", ";"))
+"""What may stand between the numbers of a coordinate."""
 
 
 def _words(text: str) -> list[str]:
@@ -238,7 +286,7 @@ def _equal(token: Token, wanted: str) -> bool:
         except ValueError:
             return False
     if token.kind == "robot":
-        return wanted in re.findall(r"[^\W\d_]+|\d+", token.text)
+        return wanted.isalpha() and wanted in re.findall(r"[^\W\d_]+", token.text)
     return _same(token.text, wanted)
 
 
@@ -357,7 +405,13 @@ def _phrase_at(reading: Reading, start: int, words: Sequence[str], taken: set[in
     at = [start]
     index = start + 1
     for word in words[1:]:
-        while index < len(tokens) and tokens[index].text in ARTICLES and tokens[index].text != word:
+        if word in ("a", "an", "the"):
+            continue
+        while (
+            index < len(tokens)
+            and (tokens[index].text in ARTICLES or tokens[index].value is not None)
+            and tokens[index].text != word
+        ):
             index += 1
         if index < len(tokens) and (tokens[index].text == word or stem(tokens[index].text) == stem(word)):
             at.append(index)
@@ -386,17 +440,16 @@ def _phrases(reading: Reading, plan: Plan, catalogue: Catalogue, found: Account)
     used: set[int] = set()
     pending: list[list[Claim]] = []
     for options in claims(reading, catalogue, taken=inside):
-        if options[0].at[0] in used:
+        start = options[0].at[0]
+        if start in used:
             continue
-        longest = (
-            max(len(each.at) for each in options if each.at[-1] - each.at[0] < len(each.at))
-            if any(each.at[-1] - each.at[0] < len(each.at) for each in options)
-            else 0
-        )
+        state = [each for each in options if reading.tokens[start].text == each.text]
+        if state and start and reading.tokens[start - 1].text in ("is", "are", "is:") and state[0].skills & planned:
+            found.covered.add(start)  # "once it is open": how a thing is then, and no order
+            continue
+        longest = max((_weight(each.text) for each in options if _joined(each)), default=0)
         fitting = [
-            each
-            for each in options
-            if each.skills & planned and (len(each.at) >= longest or each.at[-1] - each.at[0] >= len(each.at))
+            each for each in options if each.skills & planned and (_weight(each.text) >= longest or not _joined(each))
         ]
         if fitting:
             best = max(fitting, key=lambda each: len(each.at))
@@ -413,6 +466,19 @@ def _phrases(reading: Reading, plan: Plan, catalogue: Catalogue, found: Account)
         left = [each for each in options if not set(each.at) & (found.covered | lost)]
         if left:
             found.unclaimed.append(max(left, key=lambda each: len(each.at)))
+
+
+def _joined(claim: Claim) -> bool:
+    """Whether the tokens of a phrase stand together."""
+    return claim.at[-1] - claim.at[0] < len(claim.at) + 1
+
+
+def _weight(text: str) -> int:
+    """How many words of a phrase tell: "wait for" is no more telling than "wait", "put down" is than "put"."""
+    return sum(word not in _WEAK for word in text.split()) or 1
+
+
+_WEAK = frozenset(("for", "at", "to", "in", "the", "a", "an", "of", "into", "with"))
 
 
 def _param_words(reading: Reading, subtask: Subtask, found: Account) -> None:

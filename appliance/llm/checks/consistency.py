@@ -59,8 +59,14 @@ class Meaning(Struct, frozen=True, kw_only=True):
     subtasks: tuple[Subtask, ...]
 
 
-def problems(meaning: Meaning, catalogue: Catalogue) -> tuple[str, ...]:
-    """Return what speaks against a plan for an instruction, each as a sentence; nothing where it may be meant."""
+def problems(meaning: Meaning, catalogue: Catalogue, *, style: bool = True) -> tuple[str, ...]:
+    """Return what speaks against a plan for an instruction, each as a sentence; nothing where it may be meant.
+
+    Args:
+        meaning: the instruction and the plan.
+        catalogue: the skills there are.
+        style: also the rules of how values are written and that they stand in the words, which a corpus keeps.
+    """
     found: list[str] = []
     if meaning.domain not in {
         catalogue.skills[each.skill].domain for each in meaning.subtasks if each.skill in catalogue.skills
@@ -75,9 +81,9 @@ def problems(meaning: Meaning, catalogue: Catalogue) -> tuple[str, ...]:
         if manifest is None:
             found.append(f"{where}: there is no such skill")
             continue
-        found += [f"{where}: {text}" for text in _params(subtask, manifest)]
+        found += [f"{where}: {text}" for text in (_params(subtask, manifest) if style else ())]
         found += [f"{where}: {text}" for text in _robot(subtask, manifest, meaning, words)]
-        found += [f"{where}: {text}" for text in _words(subtask, words)]
+        found += [f"{where}: {text}" for text in (_words(subtask, words) if style else ())]
     return (*found, *(_order(meaning, catalogue) if not found else ()))
 
 

@@ -25,6 +25,7 @@ class Facts:
         edited: whether a person or a robot wrote the plan: the words then only give notes.
         confidence: how sure the planner is, 0 to 1.
         run_from: the confidence from which a plan runs unasked.
+        added: ids of ways that the site made necessary (`completion`): no words ask for them.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class Facts:
         edited: bool = False,
         confidence: float = 1.0,
         run_from: float = 0.0,
+        added: frozenset[str] = frozenset(),
     ) -> None:
         self.plan = plan
         self.context = context
@@ -51,6 +53,7 @@ class Facts:
         self.edited = edited
         self.confidence = confidence
         self.run_from = run_from
+        self.added = added
 
     @cached_property
     def reading(self) -> Reading:

@@ -32,12 +32,20 @@ _STEM = 4
 """Letters that two words must share to be inflections of one."""
 
 
-def ungrounded(plan: Plan, context: PlanContext) -> tuple[str, ...]:
-    """Return what a plan says and its instruction does not, each with subtask and remedy."""
+def ungrounded(plan: Plan, context: PlanContext, added: frozenset[str] = frozenset()) -> tuple[str, ...]:
+    """Return what a plan says and its instruction does not, each with subtask and remedy.
+
+    Args:
+        plan: any.
+        context: the words; of a roster that is known, robots are checked by `robots.unnamed_robot`.
+        added: subtasks that no words ask for.
+    """
     said = _said(context)
     problems: list[str] = []
-    group = bool(said & _GROUP) or context.so_far is not None
+    group = bool(said & _GROUP) or context.so_far is not None or context.robots is not None
     for subtask in plan.subtasks:
+        if subtask.id in added:
+            continue
         where = f"{shown(subtask.id)} ({shown(subtask.skill)})"
         problems += [
             f"{where}: {name} {shown(each)} is not in the instruction: take it out"

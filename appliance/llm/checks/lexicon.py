@@ -9,22 +9,25 @@ def _set(text: str) -> frozenset[str]:
 
 
 FILLERS = _set(
-    "the a an my our your its his her their some of to at in on into onto from with by near for via through inside "
+    "sending having getting taking thx dear the a an my our your its his her their some of to at in on into onto from with by near for via through inside "
     "towards toward until till upon there here then next after afterwards before once when while whilst meanwhile and "
     "also too plus as so first firstly second secondly third thirdly fourth finally lastly last subsequently please "
-    "kindly pls plz thanks thank hey hi hello ok okay alright right good now immediately straight directly just "
+    "kindly pls plz thanks thank thanks thx hey hi hello ok okay alright right good now immediately straight directly just "
     "simply both each done finished finnished complete completed ready arrived landed airborne it they he she you we "
     "i me us them him who which that this these those be been being is are has have had do does did get got let make "
     "made making tell order command instruct send must shall will should may need needs want like task job mission "
-    "step steps everything following follows during same time parallel simultaneously together respectively way soon "
+    "step steps everything following follows during same time parallel simultaneously together respectively soon "
     "own one ones itself themselves robot proceed begin begins start starts starting carry perform doing go execute "
     "sure ahead using use available fetch base gateway site warehouse yard out over along across carefully safely "
     "another other locally local between among amongst against but every all well copy roger break"
 )
 """Words that may stand beside a plan without being in it."""
 FILLER_PHRASES = (
+    "no problem at all", "no problem", "no worries", "no rush", "without exception", "if you would be so kind",
+    "be so kind", "i would appreciate it if", "we would appreciate it if", "excuse me", "would it be possible for you to",
+    "how about you", "as you go", "on my mark",
     "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to", "do not hesitate to",
-    "never mind", "i would like", "i'd like", "we would like", "we'd like", "would like you to", "could you",
+    "i would like", "i'd like", "we would like", "we'd like", "would like you to", "could you",
     "can you", "would you", "will you", "could somebody", "could someone", "can somebody", "can someone",
     "would you mind", "would you please", "if you can", "if you please", "if you would", "if you don't mind",
     "could you have", "can i have", "can we have", "could i have", "could we have", "may i have", "i want",
@@ -33,7 +36,7 @@ FILLER_PHRASES = (
     "all the way", "when you are done", "when you're done", "once you are done", "once you're done", "that's",
     "it's", "it has", "they've", "let's", "you've", "you have", "in the meantime", "at the same time", "as soon as",
     "thank you", "no hurry", "is to", "are to", "has to", "have to", "needs to", "need to", "got to", "go ahead",
-    "go and", "on your way", "from there", "over there", "over here", "by the way", "for me", "for us",
+    "go and", "from there", "over there", "over here", "by the way", "for me", "for us",
     "your job is", "one of",
 )  # fmt: skip
 """Runs of words that may stand beside a plan without being in it, longer ones first where they overlap."""
@@ -56,7 +59,7 @@ CONDITIONS = _set(
 STANDING = _set("whenever always forever constantly continuously continually")
 TIMES = _set(
     "tomorrow tonight today yesterday later noon midnight midday morning afternoon evening night daily hourly nightly "
-    "weekly monthly monday tuesday wednesday thursday friday saturday sunday week month year am pm a.m p.m o'clock "
+    "weekly monthly monday tuesday wednesday thursday friday saturday sunday week month year clock strikes am pm a.m p.m o'clock "
     "oclock periodically regularly repeatedly continuously constantly forever always schedule scheduled sunrise "
     "sunset dawn dusk lunchtime lunch shift weekday weekdays weekend weekends delay delayed minutely again repeat "
     "repeats eventually sometime whenever continually"
@@ -66,9 +69,7 @@ ALTERNATIVES = _set(
     "or either whichever whatever perhaps maybe alternatively possibly preferably might possible probably optionally"
 )
 """Words that leave open what is meant."""
-CORRECTIONS = _set(
-    "no scratch sorry actually correction rather wait oops wrong instead mean meant strike nope belay undo"
-)
+CORRECTIONS = _set("no scratch sorry actually correction rather oops wrong instead mean meant strike nope belay undo")
 """Words that take back what was said before."""
 AGAIN = _set("twice thrice again times each every more both")
 """Words that ask for a thing more than once."""
@@ -95,3 +96,25 @@ UNITS = _set(
     "feet mph kmh kph mps knot knots degree degrees deg percent yard yards mile miles inch inches day days ms"
 )
 """Words behind a figure."""
+ASKING = _set("did does was were who where why has is are what which whose am")
+"""First words of a question."""
+DELIVERY = _set(
+    "bring brings bringing deliver delivers delivering carry carries carrying transport transports take takes taking"
+)
+"""Verbs of bringing a thing to where it stays."""
+SUBORDINATE = _set("reaches arrives lands returns comes goes finishes stands")
+"""Verbs of robots that say when something is to happen."""
+IN_NO_NAME = _set("for at to while then until times laps infinity once twice every before after when where which")
+"""Words that stand in no name of a thing or place."""
+FIXTURES = _set(
+    "stopcock tap switch breaker light lights lamp lamps door doors gate gates window windows lid hatch valve fan fans heater pump pumps machine "
+    "alarm belt drawer cabinet shutter shutters power engine motor radio siren beacon camera printer screen"
+)
+"""Things that are there on most sites, whether the map lists them or not."""
+NOUNS_TOO = _set(
+    "stop stops halt abort cancel skip save bar case condition given mean right wrong rather next ignore quit prevent "
+    "last lastly finally"
+)
+"""Such words that stand in names, too: the stop sign, Mr Halt."""
+GUARDS = (NEGATIONS | CONDITIONS | EXCEPTIONS | ALTERNATIVES | CORRECTIONS | SEQUENCE | SIDE_BY_SIDE) - NOUNS_TOO
+"""Words that no name of a thing or place accounts for."""

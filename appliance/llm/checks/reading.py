@@ -74,6 +74,8 @@ KINDS = frozenset(
 """Nouns for robots."""
 _GENERAL = frozenset(("robot", "bot", "unit", "vehicle", "machine"))
 _FLYING = frozenset(("drone", "uav", "copter", "quadcopter", "quad"))
+_STARTS = frozenset((".", ";", "!", "?", "\n", ",", "and", "then", "please", "have", "let", "get", "while"))
+"""What may stand before a robot that is called by its kind alone: "drone: land"."""
 _GROUP = frozenset(("all", "both", "every", "each"))
 _EVERYBODY = frozenset(("everyone", "everybody"))
 _SOMEBODY = frozenset(("somebody", "someone", "anyone", "anybody"))
@@ -259,6 +261,18 @@ def _matches(tokens: Sequence[Token], at: int, parts: Sequence[str]) -> int:
     return index
 
 
+def with_names(instruction: str, robots: Sequence[RobotInfo] | None) -> str:
+    """Return an instruction with the names of robots that it means by their kind: "the drone" is drone_1, where one is."""
+    found = read(instruction, robots)
+    if normalise(instruction)[0] != instruction or not robots:
+        return instruction
+    text = instruction
+    for token in reversed(found.tokens):
+        if token.group == "one" and len(token.robots) == 1 and token.text != token.robots[0]:
+            text = f"{text[: token.start]}{token.robots[0]}{text[token.end :]}"
+    return text
+
+
 _Robot = tuple[str, bool]
 """Id, and whether it flies."""
 
@@ -337,6 +351,8 @@ def _group(
             named = {robot for each in before if each.group == "one" for robot in each.robots}
             which = tuple(each for each in which if each not in named)
         group = _meant(lead, count, plural=noun != kind, number=len(which))
+        if not group and not lead and len(which) == 1 and (not before or before[-1].text in _STARTS):
+            group = "one"
         if group:
             return made(index + 1, which, group)
     if lead == "both" and index == at + 1 and len(everyone) == 2 and noun not in KINDS:

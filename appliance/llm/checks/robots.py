@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 
+from appliance.llm.checks import lexicon as lx
 from appliance.llm.checks.finding import Facts, Finding, Severity
 from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.reading import Token
 from appliance.llm.checks.schema import able, is_unnamed
+from appliance.model import Subtask
 
 _NOT_SUBJECT = frozenset(
     (
@@ -40,36 +42,53 @@ def candidates(facts: Facts, name: str) -> list[str]:
 
 
 def unnamed_robot(facts: Facts) -> Iterable[Finding]:
-    """A plan moves no robot that the words neither name nor imply."""
+    """A plan moves no robot that the words neither name nor imply, where they name any."""
     if facts.robots is None or facts.continued:
         return
-    reading = facts.reading
-    named = set(reading.named)
-    loose = {robot for each in reading.tokens if each.group == "any" for robot in each.robots}
-    planned = dict.fromkeys(robot for each in facts.plan.subtasks for robot in sorted(robots_of(each)))
-    choice: list[str] = []
-    for robot in planned:
-        if is_unnamed(robot):
-            able_ = candidates(facts, robot)
-            if len(able_) > 1:
-                choice = able_
+    named = facts.reading.named
+    loose = any(each.group == "any" for each in facts.reading.tokens)
+    for robot in _planned(facts):
+        if is_unnamed(robot) or robot in named or robot == "all" or not named or loose:
             continue
-        if robot in named or robot == "all":
+        if candidates(facts, robot) == [robot] and not _covered_by_named(facts, robot):
             continue
-        able_ = candidates(facts, robot)
-        if named and not loose:
-            yield Finding(
-                check="unnamed_robot", severity=Severity.HOLD,
-                message=f"the plan uses {robot}, which the words do not name", hint="name each robot",
-            )  # fmt: skip
-        elif able_ != [robot]:
-            choice = able_
-    if choice and facts.safety.choose_robot == "ask":
         yield Finding(
             check="unnamed_robot", severity=Severity.HOLD,
-            message=f"several robots can do this, and none is named: {', '.join(choice[:8])}",
-            hint="name the robot, or set safety.choose_robot = \"auto\"",
+            message=f"the plan uses {robot}, which the words do not name", hint="name each robot",
         )  # fmt: skip
+
+
+def choose_robot(facts: Facts) -> Iterable[Finding]:
+    """Where several robots can do what is asked of none by name, a person chooses (`safety.choose_robot`)."""
+    if facts.robots is None or facts.continued or facts.safety.choose_robot != "ask":
+        return
+    named = facts.reading.named
+    loose = any(each.group == "any" for each in facts.reading.tokens)
+    for robot in _planned(facts):
+        if robot in named or robot == "all" or (named and not loose and not is_unnamed(robot)):
+            continue
+        able = candidates(facts, robot)
+        if len(able) > 1:
+            yield Finding(
+                check="choose_robot", severity=Severity.HOLD,
+                message=f"several robots can do this, and none is named: {', '.join(able[:8])}",
+                hint='name the robot, or set safety.choose_robot = "auto"',
+            )  # fmt: skip
+            return
+
+
+def _planned(facts: Facts) -> list[str]:
+    return list(dict.fromkeys(robot for each in facts.plan.subtasks for robot in sorted(robots_of(each))))
+
+
+def _covered_by_named(facts: Facts, robot: str) -> bool:
+    """Whether a robot that the words name could do all that the plan gives to this one."""
+    manifests = [
+        m for each in facts.plan.subtasks if robot in robots_of(each) and (m := facts.manifest(each)) is not None
+    ]
+    return any(
+        each.id in facts.reading.named and not any(able(each, m) for m in manifests) for each in facts.robots or ()
+    )
 
 
 def idle_robot(facts: Facts) -> Iterable[Finding]:
@@ -106,16 +125,81 @@ def assignment(facts: Facts) -> Iterable[Finding]:
         return
     for subtask in facts.plan.subtasks:
         robot = subtask.robot
-        if robot is None or robot == "all" or is_unnamed(robot):
+        if robot is None or robot == "all" or is_unnamed(robot) or subtask.id in facts.added:
             continue
-        at = facts.account.values[subtask.id] or facts.account.called[subtask.id]
-        meant = [governs[index] for index in at if governs[index]]
-        if meant and not any(robot in each for each in meant):
-            who = ", ".join(sorted(set[str]().union(*meant)))[:80]
+        values, called = facts.account.values[subtask.id], facts.account.called[subtask.id]
+        at = values or called
+        if any(facts.reading.tokens[index].text in lx.PRONOUNS for index in range(len(facts.reading.tokens))):
+            at = values | called  # "while the drone films it": the thing was said before, of another
+        meant = [governs[index] for index in at if governs[index] and _of_verb(facts, subtask, robot, index)]
+        own = [governs[index] for index in values if governs[index]]
+        if own and robot not in set[str]().union(*own) and _it_follows(facts, called):
+            yield Finding(
+                check="assignment", severity=Severity.HOLD,
+                message=f"{subtask.id} ({subtask.skill}): it is not clear what is meant by the pronoun",
+            )  # fmt: skip
+            continue
+        there = [governs[index] for index in at if governs[index]]
+        if there and not any(robot in each for each in meant):
+            who = ", ".join(sorted(set[str]().union(*there) - {robot})) or "another"
             yield Finding(
                 check="assignment", severity=Severity.HOLD,
                 message=f"{subtask.id} ({subtask.skill}) is given to {robot}, and the words give it to {who}",
             )  # fmt: skip
+
+
+def _of_verb(facts: Facts, subtask: Subtask, robot: str, index: int) -> bool:
+    """Whether a word that says a value goes with the subtask's own verb: the last one behind the robot's name, if any.
+
+    "rover_2 opens the gate, then rover_1 drives to the gate": the second gate is nothing that rover_1 opens.
+    """
+    called = facts.account.called
+    if index in called[subtask.id] or subtask.skill == "goto" or not called[subtask.id]:
+        return True
+    named = max(
+        (
+            n
+            for n, each in enumerate(facts.reading.tokens[: index + 1])
+            if each.kind == "robot" and robot in each.robots
+        ),
+        default=-1,
+    )
+    verbs = [each for found in called.values() for each in found if named < each < index] if named >= 0 else []
+    return not verbs or max(verbs) in called[subtask.id] or any(each in called[subtask.id] for each in verbs)
+
+
+def _it_follows(facts: Facts, called: set[int]) -> bool:
+    """Whether a pronoun is the object of a verb: "films it"."""
+    tokens = facts.reading.tokens
+    return any(index + 1 < len(tokens) and tokens[index + 1].text in ("it", "them") for index in called)
+
+
+def each_of_group(facts: Facts) -> Iterable[Finding]:
+    """What is asked of several robots together is done by each of them."""
+    if facts.continued or any(each.text in _DIVIDED for each in facts.reading.tokens):
+        return
+    governs = _governors(facts)
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        if manifest is None or manifest.joint or subtask.robot is None or subtask.id in facts.added:
+            continue
+        values, called = facts.account.values[subtask.id], facts.account.called[subtask.id]
+        groups = [governs[index] for index in values or called if len(governs[index]) > 1]
+        if not groups or len(groups) < len([index for index in values or called if governs[index]]):
+            continue
+        doing = {
+            each.robot for each in facts.plan.subtasks if each.skill == subtask.skill and each.params == subtask.params
+        }
+        if lacking := sorted(set.intersection(*map(set, groups)) - doing):
+            yield Finding(
+                check="assignment", severity=Severity.HOLD,
+                message=f"{subtask.id} ({subtask.skill}) is asked of {', '.join(lacking)} too",
+            )  # fmt: skip
+            return
+
+
+_DIVIDED = frozenset(("one", "other", "respectively", "between", "another", "different", "first", "second"))
+"""Words by which each robot of several has a job of its own."""
 
 
 def _governors(facts: Facts) -> list[frozenset[str]]:

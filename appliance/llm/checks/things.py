@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable
 
+from appliance.llm.checks import lexicon as lx
 from appliance.llm.checks.finding import Facts, Finding, Severity
 from appliance.llm.checks.reading import stem
 from appliance.model import Site, SiteObject, Subtask
+from appliance.skills.catalogue import SkillManifest
 
 REACH_M = 2.0
 """A robot this near to a thing can take it."""
@@ -23,7 +25,7 @@ def known_thing(name: str, site: Site) -> SiteObject | None:
 
 
 def elsewhere(facts: Facts) -> Iterable[Finding]:
-    """A robot that takes a thing is sent to where the site knows it to be, or stands there."""
+    """A robot that takes or puts down a thing is sent to where that is, or stands there."""
     if facts.site is None:
         return
     for subtask in facts.plan.subtasks:
@@ -31,35 +33,71 @@ def elsewhere(facts: Facts) -> Iterable[Finding]:
             thing = subtask.params.get("object")
             yield Finding(
                 check="elsewhere", severity=Severity.HOLD,
-                message=f"{subtask.id}: {thing} is at {where}, and {subtask.robot} is not sent there",
+                message=f"{subtask.id} ({subtask.skill} {thing}): {subtask.robot} is not sent to {where}",
                 hint=f"say where: go to {where}, then ...",
             )  # fmt: skip
 
 
 def away(facts: Facts, subtask: Subtask) -> str | None:
-    """Return where the thing is that a subtask takes, if its robot is neither sent there nor stands there."""
+    """Return the place of a subtask's thing, if its robot is neither sent there nor stands there.
+
+    A thing that is taken is where an earlier subtask put it down, else where the site has it; one that is put down goes
+    to the place that is named.
+    """
     site = facts.site
     manifest = facts.manifest(subtask)
-    if site is None or manifest is None or "load" not in manifest.ties or subtask.robot is None:
+    if site is None or manifest is None or subtask.robot is None:
         return None
-    thing = known_thing(str(subtask.params.get("object", "")), site)
-    place = site.find(thing.at) if thing is not None else None
-    if thing is None or place is None:
+    where = _taken_at(facts, subtask) if "load" in manifest.ties else _put_at(manifest, subtask)
+    place = site.find(where) if where else None
+    if place is None:
         return None
-    moved = [
-        each for each in facts.plan.subtasks
-        if each.robot == subtask.robot and each.id in facts.before[subtask.id]
-        and (m := facts.manifest(each)) is not None and m.moves_robot
-    ]  # fmt: skip
-    if any(site.find(str(each.params.get("place", ""))) is place for each in moved if each.skill == "goto"):
-        return None
-    if moved:
-        return None  # it was sent somewhere by name: that is where the words say the thing is
+    last = _last_way(facts, subtask)
+    if last is not None:
+        return None if site.find(str(last.params.get("place", ""))) is place or last.skill != "goto" else where
     robot = next((each for each in facts.robots or () if each.id == subtask.robot), None)
     pose = robot.pose if robot is not None else None
     if pose is not None and (pose.x - place.x) ** 2 + (pose.y - place.y) ** 2 <= REACH_M**2:
         return None
-    return thing.at
+    return where
+
+
+def sent_elsewhere(facts: Facts, subtask: Subtask) -> bool:
+    """Whether the words send a subtask's robot somewhere for it: the last way before it has served nothing else yet."""
+    way = _last_way(facts, subtask)
+    return way is not None and not any(
+        each.robot == subtask.robot and way.id in facts.before[each.id] and each.id in facts.before[subtask.id]
+        for each in facts.plan.subtasks
+    )
+
+
+def _taken_at(facts: Facts, subtask: Subtask) -> str:
+    """Where the thing is that a subtask takes; empty when that is not known."""
+    name = str(subtask.params.get("object", ""))
+    put = [
+        str(each.params["at"]) for each in facts.plan.subtasks
+        if each.id in facts.before[subtask.id] and each.params.get("object") == name and each.params.get("at")
+    ]  # fmt: skip
+    if put:
+        return put[-1]
+    thing = known_thing(name, facts.site) if facts.site is not None else None
+    return thing.at if thing is not None else ""
+
+
+def _put_at(manifest: SkillManifest, subtask: Subtask) -> str:
+    """Where a subtask puts down what its robot holds; empty where it does not, or does not say."""
+    puts = "load" in manifest.frees and manifest.at_object == "at"
+    return str(subtask.params.get("at", "")) if puts else ""
+
+
+def _last_way(facts: Facts, subtask: Subtask) -> Subtask | None:
+    """The last subtask before one that takes its robot somewhere."""
+    found = [
+        each for each in facts.plan.subtasks
+        if each.robot == subtask.robot and each.id in facts.before[subtask.id]
+        and (m := facts.manifest(each)) is not None and m.moves_robot
+    ]  # fmt: skip
+    return max(found, key=lambda each: len(facts.before[each.id])) if found else None
 
 
 def unknown_thing(facts: Facts) -> Iterable[Finding]:
@@ -77,13 +115,17 @@ def unknown_thing(facts: Facts) -> Iterable[Finding]:
         if not name:
             continue
         listed: list[str] = []
+        fixture = not ("load" in manifest.ties or "load" in manifest.frees) and set(name.lower().split()) & lx.FIXTURES
+        if fixture:
+            continue
         if "load" in manifest.ties or "load" in manifest.frees:
             listed = [each.name for each in site.objects]
             if listed and known_thing(name, site) is not None:
                 taken.add(name)
                 continue
         else:
-            listed = [each.name for each in (*site.doors, *site.devices)]
+            listed = [each.name for each in (*site.doors, *site.devices, *site.objects)]
+            listed += [name for key, place in site.places.items() for name in (key, *place.aliases)]
         if listed and name not in taken and not any(_like(name, each) for each in listed):
             known = ", ".join(listed[:8])
             yield Finding(

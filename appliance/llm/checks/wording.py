@@ -12,7 +12,10 @@ from functools import lru_cache
 from appliance.llm.checks import lexicon as lx
 from appliance.llm.checks.accounting import Claim, claims
 from appliance.llm.checks.finding import Facts, Finding, Severity
+from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import Token
+from appliance.llm.checks.schema import is_unnamed
+from appliance.llm.language.values import FREE
 from appliance.model import Subtask
 
 _CLOCK = re.compile(
@@ -34,6 +37,14 @@ _CLAUSE_END = frozenset((",", ";", ".", "!", "?", ":", "\n", "–", "—"))
 _SMALL = frozenset(
     (",", ";", ".", "!", "?", ":", "\n", "-", "–", "—", "(", ")", "&", "'", "/", "*", "•", "_", "…", '"', "+")
 )
+
+
+_SPARE_S = 10.0
+"""What a run of a skill needs beside the time that it is asked for."""
+_MEASURE = re.compile(
+    r"\b\d+(?:\.\d+)? ?(?:m|metres?|meters?|km|cm|s|sec|seconds?|min|minutes?|hours?|laps?|m/s|km/h|feet|ft|times)\b"
+)
+"""A quantity with its unit."""
 
 
 class Scope(Finding, frozen=True, kw_only=True):
@@ -114,8 +125,11 @@ def _scopes(facts: Facts) -> list[Scope]:
         behind = end
         inside = set(at)
         asked = [each for group in options for each in group[:2] if set(each.at) <= inside and each.at[0] > number]
-        broken = tuple(each.id for each in facts.plan.subtasks if _does(facts, each, asked, inside))
-        kept = bool(asked) and not broken
+        who = _who(facts, number, inside)
+        broken = tuple(each.id for each in facts.plan.subtasks if _does(facts, each, asked, inside, who))
+        alone = token.text in ("no", "nope") and number + 1 < len(tokens) and tokens[number + 1].kind == "mark"
+        same = any(_may_do(facts, each, asked, inside, who) for each in facts.plan.subtasks)
+        kept = bool(asked) and not broken and not alone and not same
         words = facts.words(at)
         found.append(
             Scope(
@@ -125,6 +139,16 @@ def _scopes(facts: Facts) -> list[Scope]:
         )  # fmt: skip
     facts.__dict__["_scopes"] = found
     return found
+
+
+def _who(facts: Facts, number: int, inside: set[int]) -> frozenset[str]:
+    """The robots that a negated clause is about: those in it, else those last named before it."""
+    tokens = facts.reading.tokens
+    here = frozenset(robot for index in inside for robot in tokens[index].robots)
+    if here:
+        return here
+    before = [each.robots for each in tokens[:number] if each.kind == "robot"]
+    return frozenset(before[-1]) if before else frozenset()
 
 
 def _ends_only(tokens: Sequence[Token], number: int, end: int) -> bool:
@@ -143,7 +167,6 @@ def _free_values(facts: Facts) -> set[int]:
     cached = facts.__dict__.get("_free")
     if cached is None:
         from appliance.llm.checks.accounting import free_said  # noqa: PLC0415
-        from appliance.llm.language.values import FREE  # noqa: PLC0415
 
         cached = set[int]()
         for subtask in facts.plan.subtasks:
@@ -154,20 +177,33 @@ def _free_values(facts: Facts) -> set[int]:
     return cached
 
 
-def _does(facts: Facts, subtask: Subtask, asked: Sequence[Claim], inside: set[int]) -> bool:
+def _does(facts: Facts, subtask: Subtask, asked: Sequence[Claim], inside: set[int], who: frozenset[str]) -> bool:
     """Whether a subtask does what a negated clause forbids."""
+    if subtask.robot is not None and who and subtask.robot not in who and not is_unnamed(subtask.robot):
+        return False
     account = facts.account
     values, called = account.values[subtask.id], account.called[subtask.id]
-    names = any(subtask.skill in each.skills for each in asked)
-    if not names and not (subtask.skill == "goto" and values & inside and not values - inside):
+    named = any(subtask.skill in each.skills for each in asked)
+    if not named:
+        return subtask.skill == "goto" and bool(values & inside) and not values - inside
+    if values - inside:
         return False
-    outside_call = called - inside
-    outside_value = values - inside
-    if not values:
-        return not outside_call
-    if values & inside and not outside_value:
-        return True
-    return names and not outside_call and not outside_value
+    return bool(values & inside) or not called - inside
+
+
+def _may_do(facts: Facts, subtask: Subtask, asked: Sequence[Claim], inside: set[int], who: frozenset[str]) -> bool:
+    """Whether a subtask may be what a negated clause forbids: the same skill, and the clause names nothing else."""
+    if subtask.robot is not None and who and subtask.robot not in who:
+        return False
+    if not any(subtask.skill in each.skills for each in asked):
+        return False
+    verbs = {index for each in asked for index in each.at}
+    tokens = facts.reading.tokens
+    own = [
+        index for index in inside - verbs - facts.account.covered
+        if tokens[index].kind in ("word", "number") and tokens[index].text not in lx.FILLERS | lx.NEGATIONS
+    ]  # fmt: skip
+    return not own or not facts.account.values[subtask.id]
 
 
 def forbidden(facts: Facts) -> set[int]:
@@ -259,6 +295,11 @@ def _only_reports(facts: Facts, governed: set[int], clause: set[int]) -> bool:
 
 def condition(facts: Facts) -> Iterable[Finding]:
     """What an order depends on is waited for before it is carried out."""
+    tokens = facts.reading.tokens
+    for number, token in enumerate(tokens):
+        begins = number == 0 or facts.reading.sentence[number] != facts.reading.sentence[number - 1]
+        if begins and token.text in ("should", "were", "had"):
+            yield _hold("condition", f'"{token.text}" begins a condition', (token.text,))
     for number, clause in _conditions(facts)[1]:
         words = facts.words(clause)
         first = facts.reading.tokens[number].text
@@ -301,8 +342,19 @@ def time(facts: Facts) -> Iterable[Finding]:
             hint="submit the order when it is due; a robot can wait up to 290 s, such as: wait 30 seconds, then ...",
         )  # fmt: skip
         return
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        for name, value in subtask.params.items():
+            if name == "event" and isinstance(value, str) and (set(value.split()) & lx.TIMES or _CLOCK.search(value)):
+                yield _hold("time", f'{subtask.id}: "{value}" is a time, which nobody is asked about', (value,))
+            most = manifest.timeout_s - _SPARE_S if manifest is not None else 0.0
+            if name in ("duration_s", "timeout_s") and isinstance(value, int | float) and 0 < most < value:
+                text = f"{subtask.id} ({subtask.skill}): {value:g} s is longer than a run may take, {most:g} s"
+                yield _hold("time", text, ())
     for index in sorted(rest):
         if tokens[index].kind == "word" and tokens[index].text in lx.TIMES:
+            if tokens[index].text == "again" and _after_motion(facts, index):
+                continue
             word = tokens[index].text
             hint = "clock times, delays and repeats are not supported yet: submit the order when it is due"
             yield _hold("time", f'the plan does not account for "{word}"', (word,), hint=hint)
@@ -323,8 +375,9 @@ def alternative(facts: Facts) -> Iterable[Finding]:
 def correction(facts: Facts) -> Iterable[Finding]:
     """A correction in mid-sentence is looked at by a person."""
     tokens = facts.reading.tokens
+    phrased = _phrased(facts)
     for number in left(facts):
-        if tokens[number].kind == "word" and tokens[number].text in lx.CORRECTIONS:
+        if tokens[number].kind == "word" and tokens[number].text in lx.CORRECTIONS and number not in phrased:
             yield _hold("correction", f'"{tokens[number].text}" takes something back', (tokens[number].text,),
                         hint="say the order once, as it is meant")  # fmt: skip
             return
@@ -334,13 +387,21 @@ def question(facts: Facts) -> Iterable[Finding]:
     """A question is no order, however courteous orders may end in a question mark."""
     tokens = facts.reading.tokens
     free = _free_values(facts)
+    first = next((each for each in tokens if each.kind != "mark"), None)
+    if first is not None and first.text in lx.ASKING and not any(each.text == "?" for each in tokens):
+        yield _hold("question", "it reads as a question, not as an order", (first.text,),
+                    hint="ask for the state of robots with: swiftbot robots")  # fmt: skip
     for number, token in enumerate(tokens):
         if token.text != "?" or number in free or number in facts.account.covered:
             continue
         sentence = facts.reading.sentence[number]
         inside = [index for index in range(number) if facts.reading.sentence[index] == sentence]
         words = [tokens[index].text for index in inside if tokens[index].kind == "word"]
-        if _courteous(words):
+        if (
+            _courteous(words)
+            or words[-2:] in (["would", "you"], ["will", "you"], ["could", "you"])
+            or ({"possible", "about"} & set(words[:5]) and words[:1] in (["would"], ["how"]))
+        ):
             continue
         subtasks = _of(facts, set(inside))
         if words and words[0] in ("what", "how") and subtasks and all(_perceives(facts, each) for each in subtasks):
@@ -380,6 +441,9 @@ def pronoun(facts: Facts) -> Iterable[Finding]:
             and token.text in ("that", "this", "these", "those")
         ):
             continue
+        if token.text in lx.THINGS and not (said and said[0] < number) and not _subject(facts, number):
+            yield _hold("pronoun", f'nothing was said that "{token.text}" could mean', (token.text,))
+            return
         if not before and token.text not in ("here", "her", "his"):
             yield _hold("pronoun", f'nothing was said that "{token.text}" could mean', (token.text,))
             return
@@ -390,16 +454,84 @@ def pronoun(facts: Facts) -> Iterable[Finding]:
                 yield _hold("pronoun", f'{subtask.id}: {name} is "{value}", which names nothing', (value,))
 
 
+def _subject(facts: Facts, number: int) -> bool:
+    """Whether a pronoun is who does something, and so may mean a robot: "once it is there", "let it return"."""
+    tokens = facts.reading.tokens
+    before = tokens[number - 1].text if number else ""
+    after = tokens[number + 1].text if number + 1 < len(tokens) else ""
+    called = set[int]().union(*facts.account.called.values()) if facts.account.called else set[int]()
+    return (
+        number + 1 in called
+        or after in ("is", "has", "should", "must", "shall", "will", "can", "needs", "then", "to")
+        or before in ("let", "have", "make", "once", "when", "while", "after", "until", "before", "and", "get")
+        or after in lx.SUBORDINATE
+    )
+
+
+def names(facts: Facts) -> Iterable[Finding]:
+    """A name is a name: it has swallowed neither a preposition with what follows it nor another clause."""
+    for subtask in facts.plan.subtasks:
+        if subtask.id in facts.added:
+            continue
+        for name, value in subtask.params.items():
+            if not isinstance(value, str) or name == "path":
+                continue
+            known = facts.site is not None and facts.site.find(value) is not None
+            if name in FREE:
+                words = set(re.findall(r"[a-z]+", value.lower()))
+                if name == "event" and words <= lx.FILLERS | lx.UNITS:
+                    yield _hold("names", f'{subtask.id}: "{value}" is nothing that happens', (value,))
+            elif (
+                not known and coordinate(value) is None and (set(value.lower().split()) & lx.IN_NO_NAME or "," in value)
+            ):
+                yield _hold("names", f'{subtask.id}: {name} "{value}" is more than a name', (value,))
+    for subtask, name, value in facts.account.unsaid:
+        if name not in FREE and subtask not in facts.added and value not in ("operator", "home"):
+            yield _hold("names", f'{subtask}: no words say {name} "{value}"', (value,))
+
+
 # --- words and subtasks --------------------------------------------------------------------------------------------
 
 
 def quantity(facts: Facts) -> Iterable[Finding]:
-    """Every figure stands in the plan, with its unit."""
+    """Every figure stands in the plan with its unit, and no name has swallowed one."""
     tokens = facts.reading.tokens
     for number in left(facts):
         token = tokens[number]
         if token.kind == "number" and not _item(tokens, number):
             yield _hold("quantity", f"{token.text} is said and stands nowhere in the plan", (token.text,))
+        elif token.text in ("twice", "thrice"):
+            yield _hold("quantity", f'the plan does not account for "{token.text}"', (token.text,))
+    for subtask in facts.plan.subtasks:
+        for name, value in subtask.params.items():
+            if (
+                isinstance(value, str)
+                and name not in FREE
+                and coordinate(value) is None
+                and (swallowed := _MEASURE.search(value))
+            ):
+                said = swallowed.group()
+                yield _hold(
+                    "quantity", f'{subtask.id}: {name} "{value}" holds "{said}", which is no part of a name', (said,)
+                )
+
+
+def delivery(facts: Facts) -> Iterable[Finding]:
+    """What is to be brought somewhere is put down or given there."""
+    texts = {each.text for number, each in enumerate(facts.reading.tokens) if number not in _free_values(facts)}
+    if not texts & lx.DELIVERY or facts.continued:
+        return
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        if manifest is None or "load" not in manifest.ties:
+            continue
+        later = [each for each in facts.plan.subtasks if subtask.id in facts.before[each.id]]
+        freed = any((m := facts.manifest(each)) is not None and "load" in m.frees for each in later)
+        moved = any(
+            each.robot == subtask.robot and (m := facts.manifest(each)) is not None and m.moves_robot for each in later
+        )
+        if moved and not freed:
+            yield _hold("delivery", f"{subtask.id}: {subtask.params.get('object')} is taken along and not put down", ())
 
 
 def _item(tokens: Sequence[Token], number: int) -> bool:
@@ -434,7 +566,15 @@ def coverage(facts: Facts) -> Iterable[Finding]:
             continue
         if token.kind == "word" and token.text in lx.UNITS and number and tokens[number - 1].value is not None:
             continue
-        if token.kind == "word" and token.text in ("up", "down", "back", "away") and _after_motion(facts, number):
+        if (
+            token.kind == "word"
+            and token.text in ("up", "down", "back", "away", "again")
+            and _after_motion(facts, number)
+        ):
+            continue
+        if token.text in ("up", "back", "home") and any(
+            (m := facts.manifest(each)) is not None and m.moves_robot for each in facts.plan.subtasks
+        ):
             continue
         unknown.append(number)
     if unknown:
@@ -454,11 +594,10 @@ def _later(facts: Facts, number: int) -> bool:
 
 
 def _after_motion(facts: Facts, number: int) -> bool:
-    return any(
-        number - 1 in facts.account.called[each.id]
-        for each in facts.plan.subtasks
-        if (m := facts.manifest(each)) is not None and m.moves_robot
-    )
+    before = number - 1
+    while before > 0 and facts.reading.tokens[before].text in ("it", "them"):
+        before -= 1
+    return any(before in found for found in (*facts.account.called.values(), *facts.account.values.values()))
 
 
 def polarity(facts: Facts) -> Iterable[Finding]:
@@ -489,7 +628,8 @@ def polarity(facts: Facts) -> Iterable[Finding]:
         if manifest is None:
             continue
         called = facts.account.called[subtask.id] - forbidden(facts)
-        implied = subtask.skill == "goto" and facts.account.values[subtask.id]
+        stays = set(manifest.uses) == {"base"} and not manifest.moves_robot
+        implied = (subtask.skill == "goto" or stays) and facts.account.values[subtask.id]
         if not called and not implied and not _implied(facts, subtask):
             yield _hold("polarity", f"no words ask for {subtask.id} ({subtask.skill})", ())
 
@@ -522,25 +662,30 @@ def unseen(facts: Facts) -> Iterable[Finding]:
 def sequence(facts: Facts) -> Iterable[Finding]:
     """What the words order is ordered in the plan, and what they say of the same time is not."""
     tokens = facts.reading.tokens
-    evidence = facts.account.evidence
+    subtasks = facts.plan.subtasks
+    called = facts.account.called
+    evidence = {each.id: facts.account.values[each.id] or called[each.id] for each in subtasks}
     for number, token in enumerate(tokens):
-        if token.kind != "word" or (
-            number in facts.account.covered and token.text not in lx.SEQUENCE | lx.SIDE_BY_SIDE
-        ):
+        if token.text == "first" and number and tokens[number - 1].text == "but":
+            early = [each for each in subtasks if called[each.id] and max(called[each.id]) > number]
+            late = [each for each in subtasks if called[each.id] and max(called[each.id]) < number]
+            if any(b.id not in facts.before[a.id] for a in late for b in early):
+                yield _hold("sequence", '"but first" is said, and the plan has another order', ("first",))
+                return
+        if token.kind != "word":
             continue
         if token.text in lx.SEQUENCE:
-            first = [each for each in facts.plan.subtasks if evidence[each.id] and min(evidence[each.id]) < number]
-            second = [each for each in facts.plan.subtasks if evidence[each.id] and min(evidence[each.id]) > number]
-            if first and second:
-                forward = any(a.id in facts.before[b.id] for a in first for b in second)
-                back = any(
-                    b.id in facts.before[a.id] and max(evidence[a.id]) < number for a in first for b in second
-                ) and not _reordered(tokens)
-                if back or not forward:
-                    yield _hold("sequence", f'"{token.text}" is said, and the plan has another order', (token.text,))
-                    return
+            first = [each for each in subtasks if evidence[each.id] and min(evidence[each.id]) < number]
+            second = [each for each in subtasks if evidence[each.id] and min(evidence[each.id]) > number]
+            forward = any(a.id in facts.before[b.id] for a in first for b in second)
+            back = not _reordered(tokens) and any(
+                b.id in facts.before[a.id] and max(evidence[a.id]) < number for a in first for b in second
+            )
+            if first and second and (back or not forward):
+                yield _hold("sequence", f'"{token.text}" is said, and the plan has another order', (token.text,))
+                return
         elif token.text in lx.SIDE_BY_SIDE or _phrase_here(tokens, number):
-            pairs = ((a, b) for n, a in enumerate(facts.plan.subtasks) for b in facts.plan.subtasks[n + 1 :])
+            pairs = ((a, b) for n, a in enumerate(subtasks) for b in subtasks[n + 1 :])
             if all(a.id in facts.before[b.id] or b.id in facts.before[a.id] for a, b in pairs):
                 yield _hold("sequence", f'"{token.text}" is said and nothing runs side by side', (token.text,))
                 return
