@@ -219,9 +219,9 @@ def _moves(meaning: Meaning) -> Iterable[str]:
     for subtask in meaning.subtasks:
         robot = subtask.robot or ""
         if subtask.skill == "goto":
-            if where.get(robot) == subtask.params["place"]:
+            if where.get(robot) == subtask.params.get("place"):
                 yield f"{subtask.id}: {robot} was sent there before, and nowhere since"
-            where[robot] = subtask.params["place"]
+            where[robot] = subtask.params.get("place")
         elif subtask.skill in ("takeoff", "land"):
             if height.get(robot) == subtask.skill and subtask.skill == "land":
                 yield f"{subtask.id}: {robot} has landed already"
@@ -234,11 +234,11 @@ def _moves(meaning: Meaning) -> Iterable[str]:
         elif _travels(subtask.skill):
             where.pop(robot, None)
         elif subtask.skill == "pick":
-            held.add((robot, subtask.params["object"]))
+            held.add((robot, subtask.params.get("object")))
         elif subtask.skill == "handover":
-            held.add((str(subtask.params["to"]), subtask.params["object"]))
+            held.add((str(subtask.params.get("to")), subtask.params.get("object")))
         elif subtask.skill == "place":
-            if (robot, subtask.params["object"]) not in held and not holding:
+            if (robot, subtask.params.get("object")) not in held and not holding:
                 yield f"{subtask.id}: {robot} puts down what it has not picked up"
             at, last = (_PLACE.fullmatch(str(each)) for each in (subtask.params.get("at"), where.get(robot)))
             if at and last and at[1] == last[1] and at[2] != last[2]:

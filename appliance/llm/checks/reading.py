@@ -345,7 +345,8 @@ def _group(
     if noun in ("them", "us", "you") and lead in _GROUP and index > at:
         earlier = tuple(dict.fromkeys(r for each in before if each.group == "one" for r in each.robots))
         return made(index + 1, earlier or everyone, "all")
-    if kind in KINDS and not (index + 1 < len(tokens) and tokens[index + 1].value is not None):
+    numbered = index + 1 < len(tokens) and (tokens[index + 1].value is not None or tokens[index + 1].text in ("_", "-"))
+    if kind in KINDS and not numbered:
         which = _of_kind(kind, roster)
         if other:
             named = {robot for each in before if each.group == "one" for robot in each.robots}

@@ -72,7 +72,7 @@ async def test_provenance_goes_with_the_plan(build: Build) -> None:
     plan = (await build(local, upstream).plan(ASK)).plan
     first = plan.provenance
     assert first is not None
-    assert (first.tier, first.model, first.gateway, first.confidence) == (Tier.UPSTREAM, "big", "gw-1", 0.8)
+    assert (first.tier, first.model, first.gateway, first.confidence) == (Tier.UPSTREAM, "big", "gw-1", 0.91)
     assert [each.tier for each in first.attempts] == ["local", "upstream"]
     assert first.hash == plan_hash(plan)
     assert first.latency_ms > 0
@@ -135,17 +135,17 @@ async def test_thresholds_move_with_what_becomes_of_plans(build: Build) -> None:
     assert cascade.status.thresholds["local"] > 0.65
     outcome = await cascade.plan(ASK)
     assert outcome.plan.tier is Tier.UPSTREAM
-    assert "run unasked from 0.70" in outcome.attempts[0].problems[0]
+    assert "run unasked from 0.85" in outcome.attempts[0].problems[0]
     assert cascade.status.escalated == 1
 
 
 async def test_an_unsure_plan_has_the_reason_why_it_should_wait(build: Build) -> None:
     """Below `llm.run_confidence`, which failures raise for a tier, a plan is shown and does not run."""
-    cascade = build(FakeTier(Tier.LOCAL, sure(going(), 0.45)), cache=0)
+    cascade = build(FakeTier(Tier.LOCAL, sure(going(), 0.05)), cache=0)
     plan = (await cascade.plan(ASK)).plan
     assert plan.provenance is not None
-    assert plan.provenance.confirm == ("the planner is 0.45 sure, and plans run unasked from 0.60",)
-    low = build(FakeTier(Tier.LOCAL, sure(going(), 0.45)), cache=0, run_confidence=0.4)
+    assert plan.provenance.confirm == ("the planner is 0.57 sure, and plans run unasked from 0.60",)
+    low = build(FakeTier(Tier.LOCAL, sure(going(), 0.05)), cache=0, run_confidence=0.5)
     plan = (await low.plan(ASK)).plan
     assert plan.provenance is not None
     assert plan.provenance.confirm == ()

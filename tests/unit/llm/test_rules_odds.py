@@ -24,8 +24,8 @@ def test_whatever_it_is_told_it_is_a_probability(understood: float, words: int, 
 
 @pytest.mark.anyio
 async def test_the_rules_say_how_likely_they_are_right() -> None:
-    """Whole sentences at least half, since the review holds what they leave out; half understood ones hardly at all."""
+    """A probability, not the share of the words that fitted a pattern."""
     proposal = await RulesTier(load_catalogue()).propose(
         PlanContext(instruction="Rex: go to dock 1, then take a photo")
     )
-    assert 0.6 < proposal.confidence < 0.95
+    assert 0.2 < proposal.confidence < 0.9
