@@ -86,12 +86,12 @@ def review(facts: Facts) -> Review:
 
 
 ACCOUNTED = 0.55
-"""What a plan that accounts for every word is sure of beside its planner: of the open half of the cases of `swiftbot bench
-intent` 62 of 72 such plans were right whose planner was 0.1 to 0.6 sure, and 119 of 123 of those above."""
+"""What a plan that accounts for every word is sure of beside its planner: of the open half of the cases of `swiftbot
+bench intent` 62 of 72 such plans were right whose planner was 0.1 to 0.6 sure, and 119 of 123 of those above."""
 
 
 def _accounted(facts: Facts, found: Sequence[Finding]) -> float:
-    """How sure a plan is, on the one scale of all tiers: its planner's probability, and that all words are accounted for."""
+    """How sure a plan is, on the one scale of all tiers: its planner's probability, and whether all words are in it."""
     if facts.continued or any(each.severity is not Severity.NOTE and each.check not in INTRINSIC for each in found):
         return facts.confidence
     return round(ACCOUNTED + (1 - ACCOUNTED) * facts.confidence, 4)
@@ -147,6 +147,7 @@ CHECKS: tuple[Check, ...] = (
     Check("names", wording.names, words=True),
     Check("quantity", wording.quantity, words=True),
     Check("polarity", wording.polarity, words=True),
+    Check("polarity", wording.leaving, words=True),
     Check("delivery", wording.delivery, words=True),
     Check("coverage", wording.coverage, words=True),
     Check("sequence", wording.sequence, words=True),
@@ -158,6 +159,7 @@ CHECKS: tuple[Check, ...] = (
     Check("assignment", robots.assignment, words=True),
     Check("assignment", robots.each_of_group, words=True),
     Check("elsewhere", things.elsewhere),
+    Check("not_held", things.not_held, words=True),
     Check("unknown_thing", things.unknown_thing, words=True),
     Check("consistency", _consistency, words=True),
     Check("approval", policy_holds),

@@ -92,7 +92,7 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     run_confidence: float = 0.6
     """A plan runs unasked only if its planner is at least this sure, on the one scale of all tiers (the probability
-    that the plan is right), and no check holds it. Below it the next tier is asked. Experience can raise it for a tier."""
+    that the plan is right), and no check holds it. Below it the next tier is asked. Experience can raise it."""
     show_confidence: float = 0.1
     """A valid plan that is less sure than `run_confidence` is shown to an operator down to this, when nothing better
     came; below it the instruction is refused. Of the embedded planner's plans with 0.1 to 0.3 a quarter is right, of

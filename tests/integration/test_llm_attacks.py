@@ -18,14 +18,14 @@ import pytest
 
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer, Slot
+from appliance.llm.checks.policy import places_of, robots_of
+from appliance.llm.checks.schema import is_unnamed
 from appliance.llm.embedded import EMBEDDED
 from appliance.llm.prompt import messages
-from appliance.llm.checks.policy import places_of, robots_of
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.so_far import SoFar, Step
 from appliance.llm.tier import Proposal
-from appliance.llm.checks.schema import is_unnamed
 from appliance.model import Box, Place, Plan, RobotInfo, Site, Subtask, Tier
 from appliance.skills.catalogue import load_catalogue
 

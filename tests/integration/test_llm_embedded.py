@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from appliance.llm.checks.schema import validate
 from appliance.llm.embedded import EMBEDDED, FOLDER
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.llm.checks.schema import validate
 from appliance.model import RobotInfo
 from appliance.skills.catalogue import load_catalogue
 

@@ -16,10 +16,10 @@ import pytest
 
 from appliance.errors import DeadlineError, PlanError, PrerequisiteError, SwiftbotError, UnreachableError
 from appliance.llm.cascade import Decomposer
+from appliance.llm.checks.schema import validate
 from appliance.llm.local import LocalTier
 from appliance.llm.schema import GRAMMAR_SUBTASKS
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.llm.checks.schema import validate
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
 

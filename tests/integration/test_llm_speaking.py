@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError, PrerequisiteError
 from appliance.llm import speaking
+from appliance.llm.checks.schema import validate
 from appliance.llm.language.coverage import covered
 from appliance.llm.language.evidence import FILE, UNSAID, Evidence, skills_of
 from appliance.llm.language.guide import shapes
@@ -21,7 +22,6 @@ from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.slot import Slot
 from appliance.llm.speaking import Question
-from appliance.llm.checks.schema import validate
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
 

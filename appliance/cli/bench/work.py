@@ -1,7 +1,9 @@
 """Measurements of what tasks are made of: throughput, plans, the log; and tables of what was measured."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from appliance import console
 from appliance.cli.bench.common import Ints, bench_app, measure, say, tell
@@ -40,6 +42,35 @@ def throughput(
     )  # fmt: skip
     tell(measure(run(options, progress=say)), as_json=as_json)
     return 0
+
+
+@bench_app.command
+def intent(
+    *,
+    tier: Annotated[
+        Literal["auto", "local", "rules", "wrong"],
+        Parameter(help="Who plans: the cascade, one tier alone, or an upstream that answers wrongly on purpose."),
+    ] = "auto",
+    half: Annotated[
+        Literal["open", "sealed", "all"],
+        Parameter(help="The half that the checks were developed against, the other one, or both."),
+    ] = "all",
+    cases: Annotated[
+        Path | None, Parameter(help="Folder of JSONL files of cases; by default those that come with it.")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Decide adversarial and plain instructions as a fleet would: unsafe runs, missed stops, good orders held.
+
+    Exit code 1 when something ran that may not run, or a stop was missed. Needs no fleet.
+    """
+    from appliance.bench.intent import measure as decide
+    from appliance.bench.intent import read_cases
+    from appliance.bench.intent.cases import DATA
+
+    found = measure(decide(read_cases(half, cases or DATA), tier=tier, progress=say))
+    tell(found, as_json=as_json)
+    return Exit.FAILED if found["unsafe"] or found["stops_missed"] else Exit.DONE
 
 
 @bench_app.command(name="plan")

@@ -31,11 +31,15 @@ _IRREGULAR = {
     "go": ("goes", "going", "gone"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
     "put": ("puts", "putting"), "bring": ("brings", "bringing", "brought"), "drive": ("drives", "driving", "driven"),
     "get": ("gets", "getting"), "give": ("gives", "giving", "given"), "shoot": ("shoots", "shooting"),
-    "say": ("says", "saying", "said"), "tell": ("tells", "telling"), "find": ("finds", "finding", "found"),
+    "say": ("says", "saying", "said"),
+    "tell": ("tells", "telling"), "find": ("finds", "finding", "found"),
     "hold": ("holds", "holding", "held"), "leave": ("leaves", "leaving", "left"), "set": ("sets", "setting"),
-    "shut": ("shuts", "shutting"), "come": ("comes", "coming"), "run": ("runs", "running"), "be": ("is", "are", "being"),
+    "shut": ("shuts", "shutting"),
+    "come": ("comes", "coming"),
+    "run": ("runs", "running"), "be": ("is", "are", "being"),
     "read": ("reads", "reading"), "send": ("sends", "sending", "sent"), "make": ("makes", "making"),
-    "keep": ("keeps", "keeping"), "wait": ("waits", "waiting"), "let": ("lets", "letting"), "lift": ("lifts", "lifting"),
+    "keep": ("keeps", "keeping"), "wait": ("waits", "waiting"), "let": ("lets", "letting"),
+    "lift": ("lifts", "lifting"),
 }  # fmt: skip
 _PARAM_WORDS = {
     "laps": ("lap", "laps", "times", "round", "rounds", "circuit", "circuits", "loop", "loops"),
@@ -48,7 +52,10 @@ _PARAM_WORDS = {
     "fps": ("fps", "frames", "per", "second", "rate"),
     "window_ms": ("window",),
     "epochs": ("epoch", "epochs"),
-    "place": ("coordinates", "coordinate", "position", "point", "x", "y", "z", "location", "spot", "metres", "meters", "m"),
+    "place": (
+        *("coordinates", "coordinate", "position", "point", "x", "y", "z", "location", "spot"),
+        *("metres", "meters", "m"),
+    ),
     "path": ("path", "route", "along", "via", "through"),
 }  # fmt: skip
 """Words that come with a parameter and say nothing else."""
@@ -108,6 +115,7 @@ def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | Non
                 found.covered |= said
             elif said is None:
                 found.unsaid.append((subtask.id, name, str(value)))
+    _heads(reading, plan, found)
     _phrases(reading, plan, catalogue, found)
     for subtask in plan.subtasks:
         # "until Eva confirms", "when the doorbell rings": what is waited for follows the word that says so.
@@ -179,7 +187,8 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
                 said = quantity(reading.text[window[0].start : window[-1].end], unit)
                 if said is not None and abs(float(said) - value) <= 1e-3 * max(1.0, abs(value)):
                     best = length
-        if best:
+        scaled = at + best < len(tokens) and tokens[at + best].text in ("times", "time") and unit
+        if best and not scaled:  # "four times as high" is no 4 m
             found.update(range(at, at + best))
         at += max(1, best)
     return found or None
@@ -193,7 +202,7 @@ def _ends_number(token: Token) -> bool:
 
 
 def _ends_quantity(token: Token) -> bool:
-    return _starts_quantity(token) or token.text in lx.UNITS or token.text in ("times", "time", "quarters", "dozen")
+    return _starts_quantity(token) or token.text in lx.UNITS or token.text in ("quarters", "dozen")
 
 
 def _starts_quantity(token: Token) -> bool:
@@ -331,6 +340,22 @@ def _scattered(reading: Reading, wanted: Sequence[str]) -> set[int] | None:
     return found or None
 
 
+def _heads(reading: Reading, plan: Plan, found: Account) -> None:
+    """Cover a thing that is spoken of again by its noun alone: "the blue box ... as soon as the box is there"."""
+    heads = {
+        words[-1] for each in plan.subtasks for value in each.params.values()
+        if isinstance(value, str) and len(words := _words(value)) > 1 and words[-1].isalpha()
+    }  # fmt: skip
+    for number, token in enumerate(reading.tokens):
+        if (
+            number
+            and token.kind == "word"
+            and token.text in heads
+            and reading.tokens[number - 1].text in ("the", "that")
+        ):
+            found.covered.add(number)
+
+
 # --- skills --------------------------------------------------------------------------------------------------------
 
 
@@ -441,8 +466,8 @@ def _phrases(reading: Reading, plan: Plan, catalogue: Catalogue, found: Account)
     pending: list[list[Claim]] = []
     for options in claims(reading, catalogue, taken=inside):
         start = options[0].at[0]
-        if start in used:
-            continue
+        if start in used or (start and reading.tokens[start - 1].text == "the"):
+            continue  # "the dock" is a thing
         state = [each for each in options if reading.tokens[start].text == each.text]
         if state and start and reading.tokens[start - 1].text in ("is", "are", "is:") and state[0].skills & planned:
             found.covered.add(start)  # "once it is open": how a thing is then, and no order

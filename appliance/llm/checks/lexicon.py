@@ -9,35 +9,37 @@ def _set(text: str) -> frozenset[str]:
 
 
 FILLERS = _set(
-    "sending having getting taking thx dear the a an my our your its his her their some of to at in on into onto from with by near for via through inside "
-    "towards toward until till upon there here then next after afterwards before once when while whilst meanwhile and "
-    "also too plus as so first firstly second secondly third thirdly fourth finally lastly last subsequently please "
-    "kindly pls plz thanks thank thanks thx hey hi hello ok okay alright right good now immediately straight directly just "
-    "simply both each done finished finnished complete completed ready arrived landed airborne it they he she you we "
-    "i me us them him who which that this these those be been being is are has have had do does did get got let make "
-    "made making tell order command instruct send must shall will should may need needs want like task job mission "
-    "step steps everything following follows during same time parallel simultaneously together respectively soon "
-    "own one ones itself themselves robot proceed begin begins start starts starting carry perform doing go execute "
-    "sure ahead using use available fetch base gateway site warehouse yard out over along across carefully safely "
-    "another other locally local between among amongst against but every all well copy roger break"
+    "sending having getting taking thx dear the a an my our your its his her their some of to at in on into onto from "
+    "with by near for via through inside towards toward until till upon there here then next after afterwards before "
+    "once when while whilst meanwhile and also too plus as so first firstly second secondly third thirdly fourth "
+    "finally lastly last subsequently please kindly pls plz thanks thank hey hi hello ok okay alright right good now "
+    "immediately straight directly just simply both each done finished finnished complete completed ready arrived "
+    "landed airborne it they he she you we i me us them him who which that this these those be been being is are has "
+    "have had do does did get got let make made making tell order command instruct send must shall will should may "
+    "need needs want like task job mission step steps everything following follows during same time parallel "
+    "simultaneously together respectively soon own one ones itself themselves robot proceed begin begins start starts "
+    "starting carry perform doing go execute sure ahead using use available fetch base gateway site warehouse yard "
+    "out over along across carefully safely another other locally local between among amongst against but every all "
+    "well copy roger break"
 )
 """Words that may stand beside a plan without being in it."""
 FILLER_PHRASES = (
-    "no problem at all", "no problem", "no worries", "no rush", "without exception", "if you would be so kind",
-    "be so kind", "i would appreciate it if", "we would appreciate it if", "excuse me", "would it be possible for you to",
-    "how about you", "as you go", "on my mark",
-    "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to", "do not hesitate to",
-    "i would like", "i'd like", "we would like", "we'd like", "would like you to", "could you",
-    "can you", "would you", "will you", "could somebody", "could someone", "can somebody", "can someone",
-    "would you mind", "would you please", "if you can", "if you please", "if you would", "if you don't mind",
-    "could you have", "can i have", "can we have", "could i have", "could we have", "may i have", "i want",
-    "i need", "we want", "we need", "make sure", "be sure", "in that order", "in this order", "in order",
-    "one after the other", "one by one", "right away", "right now", "straight away", "at once", "as well",
-    "all the way", "when you are done", "when you're done", "once you are done", "once you're done", "that's",
-    "it's", "it has", "they've", "let's", "you've", "you have", "in the meantime", "at the same time", "as soon as",
-    "thank you", "no hurry", "is to", "are to", "has to", "have to", "needs to", "need to", "got to", "go ahead",
-    "go and", "from there", "over there", "over here", "by the way", "for me", "for us",
-    "your job is", "one of",
+    "where it is", "where it stands", "where they are", "at the end", "in position", "has answered",
+    "have answered", "how many there are", "is answered", "no problem at all", "no problem", "no worries",
+    "no rush", "without exception", "if you would be so kind", "be so kind", "i would appreciate it if",
+    "we would appreciate it if", "excuse me", "would it be possible for you to", "how about you", "as you go",
+    "on my mark", "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to",
+    "do not hesitate to", "i would like", "i'd like", "we would like", "we'd like", "would like you to",
+    "could you", "can you", "would you", "will you", "could somebody", "could someone", "can somebody",
+    "can someone", "would you mind", "would you please", "if you can", "if you please", "if you would",
+    "if you don't mind", "could you have", "can i have", "can we have", "could i have", "could we have",
+    "may i have", "i want", "i need", "we want", "we need", "make sure", "be sure", "in that order",
+    "in this order", "in order", "one after the other", "one by one", "right away", "right now", "straight away",
+    "at once", "as well", "all the way", "when you are done", "when you're done", "once you are done",
+    "once you're done", "that's", "it's", "it has", "they've", "let's", "you've", "you have", "in the meantime",
+    "at the same time", "as soon as", "thank you", "no hurry", "is to", "are to", "has to", "have to", "needs to",
+    "need to", "got to", "go ahead", "go and", "from there", "over there", "over here", "by the way", "for me",
+    "for us", "your job is",
 )  # fmt: skip
 """Runs of words that may stand beside a plan without being in it, longer ones first where they overlap."""
 NEGATIONS = _set(
@@ -59,10 +61,10 @@ CONDITIONS = _set(
 STANDING = _set("whenever always forever constantly continuously continually")
 TIMES = _set(
     "tomorrow tonight today yesterday later noon midnight midday morning afternoon evening night daily hourly nightly "
-    "weekly monthly monday tuesday wednesday thursday friday saturday sunday week month year clock strikes am pm a.m p.m o'clock "
-    "oclock periodically regularly repeatedly continuously constantly forever always schedule scheduled sunrise "
-    "sunset dawn dusk lunchtime lunch shift weekday weekdays weekend weekends delay delayed minutely again repeat "
-    "repeats eventually sometime whenever continually"
+    "weekly monthly monday tuesday wednesday thursday friday saturday sunday week month year clock strikes am pm a.m "
+    "p.m o'clock oclock periodically regularly repeatedly continuously constantly forever always schedule scheduled "
+    "sunrise sunset dawn dusk lunchtime lunch shift weekday weekdays weekend weekends delay delayed minutely again "
+    "repeat repeats eventually sometime whenever continually"
 )
 """Words of clock times, dates and repeats."""
 ALTERNATIVES = _set(
@@ -104,11 +106,15 @@ DELIVERY = _set(
 """Verbs of bringing a thing to where it stays."""
 SUBORDINATE = _set("reaches arrives lands returns comes goes finishes stands")
 """Verbs of robots that say when something is to happen."""
-IN_NO_NAME = _set("for at to while then until times laps infinity once twice every before after when where which")
+IN_NO_NAME = _set(
+    "quarter half double turn degrees percent for at to while then until times laps infinity once twice every before "
+    "after when where which"
+)
 """Words that stand in no name of a thing or place."""
 FIXTURES = _set(
-    "stopcock tap switch breaker light lights lamp lamps door doors gate gates window windows lid hatch valve fan fans heater pump pumps machine "
-    "alarm belt drawer cabinet shutter shutters power engine motor radio siren beacon camera printer screen"
+    "stopcock tap switch breaker light lights lamp lamps door doors gate gates window windows lid hatch valve fan "
+    "fans heater pump pumps machine alarm belt drawer cabinet shutter shutters power engine motor radio siren beacon "
+    "camera printer screen"
 )
 """Things that are there on most sites, whether the map lists them or not."""
 NOUNS_TOO = _set(
@@ -116,5 +122,7 @@ NOUNS_TOO = _set(
     "last lastly finally"
 )
 """Such words that stand in names, too: the stop sign, Mr Halt."""
+AWAY = frozenset((("away", "from"), ("out", "of"), ("clear", "of"), ("far", "from"), ("off", "of"), ("back", "from")))
+"""Words before a place that a robot is to leave."""
 GUARDS = (NEGATIONS | CONDITIONS | EXCEPTIONS | ALTERNATIVES | CORRECTIONS | SEQUENCE | SIDE_BY_SIDE) - NOUNS_TOO
 """Words that no name of a thing or place accounts for."""

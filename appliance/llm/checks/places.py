@@ -144,6 +144,19 @@ def place_problems(subtask: Subtask, site: Site, *, moves: bool = True) -> Itera
                 found = coordinate(part)
                 if found is not None:
                     yield from _point(found, part, site)
+    radius = params.get("radius_m")
+    around = locate(str(params.get("target", "")), site)
+    if _number(radius) and site.fence is not None:
+        fence = site.fence
+        near = around or Place(x=sum(fence.x) / 2, y=sum(fence.y) / 2)
+        edges = [
+            (near.x - radius, near.y),
+            (near.x + radius, near.y),
+            (near.x, near.y - radius),
+            (near.x, near.y + radius),
+        ]
+        if any(outside(Place(x=x, y=y), site) for x, y in edges):
+            yield f"a radius of {radius:g} m leads outside the fence {fence.name}: ask for less"
     altitude = params.get("altitude_m")
     if _number(altitude) and altitude > site.altitude_limit_m:
         yield f"altitude {altitude:g} m is above this site's limit of {site.altitude_limit_m:g} m"

@@ -262,7 +262,7 @@ def _matches(tokens: Sequence[Token], at: int, parts: Sequence[str]) -> int:
 
 
 def with_names(instruction: str, robots: Sequence[RobotInfo] | None) -> str:
-    """Return an instruction with the names of robots that it means by their kind: "the drone" is drone_1, where one is."""
+    """Return an instruction with names of robots for their kinds: "the drone" is drone_1, where there is one."""
     found = read(instruction, robots)
     if normalise(instruction)[0] != instruction or not robots:
         return instruction

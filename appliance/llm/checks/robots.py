@@ -184,13 +184,14 @@ def each_of_group(facts: Facts) -> Iterable[Finding]:
         if manifest is None or manifest.joint or subtask.robot is None or subtask.id in facts.added:
             continue
         values, called = facts.account.values[subtask.id], facts.account.called[subtask.id]
-        groups = [governs[index] for index in values or called if len(governs[index]) > 1]
+        groups: list[frozenset[str]] = [governs[index] for index in values or called if len(governs[index]) > 1]
         if not groups or len(groups) < len([index for index in values or called if governs[index]]):
             continue
         doing = {
             each.robot for each in facts.plan.subtasks if each.skill == subtask.skill and each.params == subtask.params
         }
-        if lacking := sorted(set.intersection(*map(set, groups)) - doing):
+        asked = groups[0].intersection(*groups[1:])
+        if lacking := sorted(asked - doing):
             yield Finding(
                 check="assignment", severity=Severity.HOLD,
                 message=f"{subtask.id} ({subtask.skill}) is asked of {', '.join(lacking)} too",

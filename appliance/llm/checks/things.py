@@ -100,6 +100,33 @@ def _last_way(facts: Facts, subtask: Subtask) -> Subtask | None:
     return max(found, key=lambda each: len(facts.before[each.id])) if found else None
 
 
+def not_held(facts: Facts) -> Iterable[Finding]:
+    """A robot puts down or gives what it holds, or has picked up before."""
+    if facts.robots is None or facts.continued or _HOLDS & {each.text for each in facts.reading.tokens}:
+        return
+    holding = {each.id: each.holding for each in facts.robots}
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        if manifest is None or "load" not in manifest.frees or subtask.robot is None:
+            continue
+        thing = subtask.params.get("object")
+        taken = any(
+            each.params.get("object") == thing and each.id in facts.before[subtask.id]
+            and (m := facts.manifest(each)) is not None and "load" in m.ties
+            for each in facts.plan.subtasks
+        )  # fmt: skip
+        if not taken and not holding.get(subtask.robot):
+            yield Finding(
+                check="not_held", severity=Severity.HOLD,
+                message=f"{subtask.id} ({subtask.skill}): {subtask.robot} neither holds {thing} nor picks it up",
+                hint="say where it is to be picked up",
+            )  # fmt: skip
+
+
+_HOLDS = frozenset(("holds", "holding", "held", "carries", "carrying", "has", "hand"))
+"""Words that say that a robot has something already."""
+
+
 def unknown_thing(facts: Facts) -> Iterable[Finding]:
     """What is taken, opened or switched is a thing of the site, where the site lists such things."""
     site = facts.site

@@ -13,7 +13,7 @@ from appliance.llm.checks import lexicon as lx
 from appliance.llm.checks.accounting import Claim, claims
 from appliance.llm.checks.finding import Facts, Finding, Severity
 from appliance.llm.checks.places import coordinate
-from appliance.llm.checks.reading import Token
+from appliance.llm.checks.reading import NUMBERS, Token
 from appliance.llm.checks.schema import is_unnamed
 from appliance.llm.language.values import FREE
 from appliance.model import Subtask
@@ -35,16 +35,22 @@ _REPEATED = re.compile(
 )
 _CLAUSE_END = frozenset((",", ";", ".", "!", "?", ":", "\n", "–", "—"))
 _SMALL = frozenset(
-    (",", ";", ".", "!", "?", ":", "\n", "-", "–", "—", "(", ")", "&", "'", "/", "*", "•", "_", "…", '"', "+")
+    (",", ";", ".", "!", "?", ":", "\n", "=", "-", "–", "—", "(", ")", "&", "'", "/", "*", "•", "_", "…", '"', "+")
 )
 
 
+_LONGEST_S = 290.0
+"""A wait that any skill may take."""
 _SPARE_S = 10.0
 """What a run of a skill needs beside the time that it is asked for."""
 _MEASURE = re.compile(
     r"\b\d+(?:\.\d+)? ?(?:m|metres?|meters?|km|cm|s|sec|seconds?|min|minutes?|hours?|laps?|m/s|km/h|feet|ft|times)\b"
 )
 """A quantity with its unit."""
+
+
+_NO_EVENT = lx.UNITS | frozenset(NUMBERS) | {"at", "for", "in", "about", "a", "an", "half", "after", "the", "of", "and"}
+"""A quantity alone is nothing that happens."""
 
 
 class Scope(Finding, frozen=True, kw_only=True):
@@ -347,7 +353,7 @@ def time(facts: Facts) -> Iterable[Finding]:
         for name, value in subtask.params.items():
             if name == "event" and isinstance(value, str) and (set(value.split()) & lx.TIMES or _CLOCK.search(value)):
                 yield _hold("time", f'{subtask.id}: "{value}" is a time, which nobody is asked about', (value,))
-            most = manifest.timeout_s - _SPARE_S if manifest is not None else 0.0
+            most = max(_LONGEST_S, manifest.timeout_s - _SPARE_S) if manifest is not None else 0.0
             if name in ("duration_s", "timeout_s") and isinstance(value, int | float) and 0 < most < value:
                 text = f"{subtask.id} ({subtask.skill}): {value:g} s is longer than a run may take, {most:g} s"
                 yield _hold("time", text, ())
@@ -468,6 +474,28 @@ def _subject(facts: Facts, number: int) -> bool:
     )
 
 
+def _uses(facts: Facts, subtask: Subtask) -> tuple[str, ...]:
+    manifest = facts.manifest(subtask)
+    return manifest.uses if manifest is not None else ()
+
+
+def leaving(facts: Facts) -> Iterable[Finding]:
+    """A place that a robot is to leave is not where it is sent."""
+    tokens = facts.reading.tokens
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        if manifest is None or not manifest.moves_robot:
+            continue
+        for index in facts.account.values[subtask.id]:
+            before = index - 1
+            while before > 0 and tokens[before].text in ("the", "a", "our"):
+                before -= 1
+            if before > 0 and (tokens[before - 1].text, tokens[before].text) in lx.AWAY:
+                words = f"{tokens[before - 1].text} {tokens[before].text}"
+                yield _hold("polarity", f'{subtask.id}: the words say "{words}", and the plan goes there', (words,))
+                break
+
+
 def names(facts: Facts) -> Iterable[Finding]:
     """A name is a name: it has swallowed neither a preposition with what follows it nor another clause."""
     for subtask in facts.plan.subtasks:
@@ -477,9 +505,17 @@ def names(facts: Facts) -> Iterable[Finding]:
             if not isinstance(value, str) or name == "path":
                 continue
             known = facts.site is not None and facts.site.find(value) is not None
+            if value.lower() in ("him", "her", "them", "it", "there"):
+                yield _hold("names", f'{subtask.id}: {name} "{value}" names nobody and nothing', (value,))
             if name in FREE:
+                last = re.findall(r"[\w']+|\.\.\.", value.lower())[-1:]
+                quoted = any(each.kind == "quote" for each in facts.reading.tokens)
+                if not quoted and last and (last[0] in lx.NEGATIONS or "..." in value):
+                    yield _hold("names", f'{subtask.id}: "{value}" takes something back at its end', (value,))
+                if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
+                    yield _hold("names", f"{subtask.id}: a robot cannot speak to the operator: notify does", ())
                 words = set(re.findall(r"[a-z]+", value.lower()))
-                if name == "event" and words <= lx.FILLERS | lx.UNITS:
+                if name == "event" and words <= _NO_EVENT:
                     yield _hold("names", f'{subtask.id}: "{value}" is nothing that happens', (value,))
             elif (
                 not known and coordinate(value) is None and (set(value.lower().split()) & lx.IN_NO_NAME or "," in value)
@@ -627,6 +663,8 @@ def polarity(facts: Facts) -> Iterable[Finding]:
         manifest = facts.manifest(subtask)
         if manifest is None:
             continue
+        if subtask.id in facts.added:
+            continue
         called = facts.account.called[subtask.id] - forbidden(facts)
         stays = set(manifest.uses) == {"base"} and not manifest.moves_robot
         implied = (subtask.skill == "goto" or stays) and facts.account.values[subtask.id]
@@ -689,7 +727,25 @@ def sequence(facts: Facts) -> Iterable[Finding]:
             if all(a.id in facts.before[b.id] or b.id in facts.before[a.id] for a, b in pairs):
                 yield _hold("sequence", f'"{token.text}" is said and nothing runs side by side', (token.text,))
                 return
+    yield from _opposites(facts)
     yield from _before_after(facts)
+
+
+def _opposites(facts: Facts) -> Iterable[Finding]:
+    """Two orders that undo each other come in the order in which they are said."""
+    tokens, called = facts.reading.tokens, facts.account.called
+    if any(each.text in ("before", "after", "first", "until") for each in tokens):
+        return
+    for one in facts.plan.subtasks:
+        for two in facts.plan.subtasks:
+            manifest = facts.manifest(one)
+            opposed = manifest is not None and two.skill in manifest.opposite_of
+            if not opposed or one.params.get("object") != two.params.get("object") or one.robot != two.robot:
+                continue
+            first, second = called[one.id], called[two.id]
+            if one.id in facts.before[two.id] and first and second and min(first) > max(second):
+                yield _hold("sequence", f"{two.id} ({two.skill}) is said before {one.id} ({one.skill})", ())
+                return
 
 
 def _phrase_here(tokens: Sequence[Token], number: int) -> bool:
@@ -705,6 +761,8 @@ def repeated(facts: Facts) -> Iterable[Finding]:
     seen: list[tuple[object, ...]] = []
     for subtask in facts.plan.subtasks:
         manifest = facts.manifest(subtask)
+        if manifest is not None and manifest.moves_robot:
+            seen = [each for each in seen if each[1] != subtask.robot]  # elsewhere the same is another thing
         what = (subtask.skill, subtask.robot, subtask.params)
         if manifest is not None and not manifest.repeats and what in seen:
             yield _hold("repeated", f"{subtask.id} ({subtask.skill}) is planned twice", ())

@@ -46,7 +46,6 @@ def build(catalogue: Catalogue) -> Build:
             Slot(
                 planner=tier,
                 deadline_s=5.0,
-
                 leaves_machine=tier.name in (Tier.UPSTREAM, Tier.PEER),
                 instead_of=Tier.LOCAL if tier.name is Tier.PEER else None,
             )
