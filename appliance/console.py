@@ -4,6 +4,7 @@ Rich finds out whether it writes to a terminal: without one there are no colours
 """
 
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -40,9 +41,11 @@ from appliance.tasks.replay import ReplayReport
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
 
-# No text of a user is markup: an instruction may hold "[/red]".
-out = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-err = Console(stderr=True, highlight=False, markup=False, width=None if sys.stderr.isatty() else PIPE_WIDTH)
+# No text of a user is markup: an instruction may hold "[/red]" or ":warning:".
+out = Console(highlight=False, markup=False, emoji=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = Console(
+    stderr=True, highlight=False, markup=False, emoji=False, width=None if sys.stderr.isatty() else PIPE_WIDTH
+)
 
 _STYLES = {
     SubtaskState.WAITING: "dim",
@@ -112,25 +115,27 @@ def plan_graph(plan: Plan) -> Group:
 def held_text(record: TaskRecord) -> Group:
     """A plan that waits for approval: what it does, why it waits, how to approve it, until when."""
     proposal = record.proposal
-    if proposal is None:
-        return Group(Text(""))
-    left = f" within {proposal.expires_s:.0f} s, else it fails" if proposal.expires_s else ""
+    if proposal is None or not proposal.waits:
+        return Group()
     lines = [
-        f"task {record.id} waits for approval{left}: {proposal.note}",
+        f"task {record.id} waits for approval: {proposal.note or 'its plan is to be approved first'}",
         f"approve: swiftbot task approve {record.id} --hash {proposal.hash[:12]}",
         f"reject:  swiftbot task reject {record.id}",
     ]
-    return Group(plan_graph(proposal.plan), Text("\n".join(lines)))
+    if proposal.expires_s:
+        left_s = max(0.0, proposal.expires_s - (record.elapsed_s - proposal.since_s))
+        until = datetime.fromtimestamp(time.time() + left_s).astimezone()
+        lines.append(f"deadline: {until:%H:%M:%S} (in {left_s:.0f} s); without approval it fails")
+    return Group(plan_graph(proposal.plan), Text("\n".join(lines), style="bold yellow"))
 
 
-def asked(question: str) -> bool:
-    """Ask on the terminal; whether the answer is yes."""
-    try:
-        answer = out.input(f"{question} [y/N] ")
-    except (EOFError, KeyboardInterrupt):
-        out.print()
-        return False
-    return answer.strip().lower() in ("y", "yes")
+def tell_held(record: TaskRecord, told: str) -> str:
+    """Print a plan that has begun to wait for approval, unless its hash is `told`; return the last hash printed."""
+    proposal = record.proposal
+    if proposal is None or not proposal.waits or record.state.final or proposal.hash == told:
+        return told
+    err.print(held_text(record))
+    return proposal.hash
 
 
 def plan_answer(answer: PlanAnswer) -> Group:

@@ -82,12 +82,16 @@ async def _one(client: FleetClient, instruction: str) -> TaskRecord:
     return await follow(client, accepted.id)
 
 
-async def follow(client: FleetClient, task: str) -> TaskRecord:
-    """Show a task's plan, each change of a subtask, and the results at its end; returns its last record."""
-    shown_plan = False
+async def follow(client: FleetClient, task: str, *, plan_shown: bool = False) -> TaskRecord:
+    """Show a task's plan, each change of a subtask, and the results at its end; returns its last record.
+
+    A plan that waits for approval is shown at once, with why it waits and how to approve it.
+    """
+    shown_plan, held = plan_shown, ""
     told: dict[str, tuple[SubtaskState, str, int]] = {}
     record: TaskRecord | None = None
     async for record in client.watch(task):
+        held = console.tell_held(record, held)
         if record.plan is not None and record.subtasks and not shown_plan:
             shown_plan = True
             console.out.print(console.plan_graph(record.plan))

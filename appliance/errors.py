@@ -9,6 +9,7 @@
     ├── ConflictError        the record has moved on since it was read (optimistic concurrency)
     ├── NotFoundError        no such task, robot, container, file
     ├── RefusedError         understood and declined, with the reason (capacity, draining, stale attempt)
+    │   └── UnapprovedError  no operator approved the plan in time
     ├── PlanError            no valid plan for the instruction
     ├── PoolError            a container could not be started, reached or kept
     ├── RobotError           a robot did not do what was asked
@@ -45,6 +46,8 @@ class Exit(IntEnum):
     """no result in time"""
     CANCELLED = 7
     """cancelled"""
+    REJECTED = 8
+    """its plan was rejected, or not approved in time"""
     INTERRUPTED = 130
     """interrupted"""
 
@@ -126,6 +129,13 @@ class RefusedError(SwiftbotError):
 
     code = "refused"
     exit_code = Exit.REFUSED
+
+
+class UnapprovedError(RefusedError):
+    """No operator approved the plan in time."""
+
+    code = "unapproved"
+    exit_code = Exit.REJECTED
 
 
 class PlanError(SwiftbotError):

@@ -2,7 +2,7 @@
 
 import asyncio
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -10,6 +10,9 @@ from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, Exit
+
+if TYPE_CHECKING:
+    from appliance.llm.stop_words import StopRequest
 
 
 def add_to(app: App) -> None:
@@ -40,9 +43,9 @@ def plan(
 ) -> int:
     """Decompose an instruction and print the plan with what it asks for; nothing is run.
 
-    With --batch and --out each case `{"id", "instruction", "robots"?}` gets a line with plan, tier, confidence, latency,
-    `decision` (run, hold, refuse, stop) and the checks that spoke. Ctrl-C keeps what is written, and the same command
-    goes on. Lines that are no case are listed with their numbers and end the command with exit code 4.
+    With --batch and --out each case `{"id", "instruction", "robots"?}` gets a line with plan, tier, confidence,
+    latency, `decision` (run, hold, refuse, stop) and the checks that spoke. Ctrl-C keeps what is written, and the same
+    command goes on. Lines that are no case are listed with their numbers and end the command with exit code 4.
     """
     if batch is not None or out is not None:
         if batch is None or out is None or text:
@@ -52,21 +55,26 @@ def plan(
         raise ConfigError("there is no instruction", remedy='such as: swiftbot plan "Robot_1: go to goal 2"')
 
     from appliance.llm.stop_words import stop_request
+    from appliance.stopping import roster_of
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             await client.gateway()
-            stop = stop_request(text, tuple(client.plane.registry.robots))
-            if stop is not None:
-                who = " ".join(stop.robots)
-                told = f"a stop, not a task{f' of {who}' if who else ''}: swiftbot stop {who}".rstrip()
-                show({"decision": "stop", "robots": stop.robots}, as_json=as_json, table=told)
+            if (stop := stop_request(text, roster_of(client))) is not None:
+                unknown = {"unknown": stop.unknown} if stop.unknown else {}
+                show({"decision": "stop", "robots": stop.robots, **unknown}, as_json=as_json, table=_stop_text(stop))
                 return
             answer = await client.plan(text, private=private)
         show(answer, as_json=as_json, table=console.plan_answer(answer))
 
     asyncio.run(go())
     return 0
+
+
+def _stop_text(stop: "StopRequest") -> str:
+    names = [*stop.robots, *(f"{each} (no such robot)" for each in stop.unknown)]
+    who = ", ".join(names) or "all robots"
+    return f"stop: {who} (soft stop; `swiftbot submit` or `swiftbot stop` carries it out)"
 
 
 def _batch(cases: Path, out: Path, tier: str, model: str, config: Path | None, site: str, *, as_json: bool) -> int:

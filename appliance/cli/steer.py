@@ -4,10 +4,11 @@ And of `task`: `approve`, `reject`, `check`, `pause`, `resume`, `retry`. Robots 
 """
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
@@ -15,11 +16,14 @@ from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.cli.work import task_app
 from appliance.client import FleetClient
-from appliance.errors import ConfigError, Exit
+from appliance.errors import ConfigError, Exit, SwiftbotError
 from appliance.model import Plan, TaskRecord
 from appliance.robots.authority.api import StopAnswer
 from appliance.steering import read_plan_file
 from appliance.tasks.view import view
+
+if TYPE_CHECKING:
+    from appliance.stopping import Stopped
 
 llm_app = App(name="llm", help="Language models of gateways.", group=WORK)
 
@@ -149,59 +153,56 @@ def stop(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE
     """Soft stop: robots hold, and are given no command until `resume`; none named: the whole fleet.
 
     Commands in flight are cancelled and the tasks that need the robots are paused. It survives restarts of gateways.
-    It is no safety-rated emergency stop: that is a switch at the robot. Exit code 1 when a robot did not confirm, one
-    that is offline too: it is stopped when it is back. A name that no robot has stops nothing, and is reported first.
+    It is no safety-rated emergency stop: that is a switch at the robot. Names may be typed as "Rover_1", "rover 1",
+    "drones". Exit code 1 when a robot did not confirm, one that is offline too: it is stopped when it is back. A name
+    that no robot has stops nothing and is reported first (exit code 4 when nothing was stopped).
     """
     return carry_out_stop(robots, why=why, as_json=as_json, where=where)
 
 
 def carry_out_stop(names: tuple[str, ...], *, why: str, as_json: bool, where: Where) -> int:
-    """Stop the robots that are there, all when none is named; print what came of it, the unknown names first."""
-    from appliance.stopping import Stopped, unknown_text
+    """Stop the robots of these names, all when there are none, and print what came of it."""
+    from appliance.stopping import Stopped
 
     async def go() -> Stopped:
         async with FleetClient(where.endpoint()) as client:
             return await Stopped.carry_out(client, names, why=why)
 
-    done = asyncio.run(go())
-    lines = [unknown_text(name, done.roster) for name in done.unknown]
-    if done.answer is not None:
-        lines.append(_told(done.answer, asked=done.robots))
-    elif done.unknown:
-        lines.append("no robot was stopped; to stop all of them: swiftbot stop")
-    show(done.as_json(), as_json=as_json, table="\n".join(lines))
+    with said_of_stop():
+        done = asyncio.run(go())
+    return show_stopped(done, as_json=as_json)
+
+
+@contextlib.contextmanager
+def said_of_stop(is_stop: bool = True) -> Generator[None]:
+    """Say first that a stop is not confirmed when it ends with an error."""
+    try:
+        yield
+    except SwiftbotError:
+        if is_stop:
+            console.err.print("NOT CONFIRMED: use the switch at a robot that moves")
+        raise
+
+
+def show_stopped(done: "Stopped", *, as_json: bool) -> int:
+    """Print what came of a stop; the exit code says whether all of it is confirmed."""
+    show(done.as_json(), as_json=as_json, table=done.text())
     if done.unknown:
-        return Exit.REFUSED
-    return Exit.FAILED if done.answer is None or done.answer.silent or done.answer.problems else Exit.DONE
+        return Exit.REFUSED if done.answer is None else Exit.FAILED
+    return Exit.DONE if done.confirmed else Exit.FAILED
 
 
 def resume(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE) -> int:
     """Lift soft stops: of these robots, or all of them; the tasks go on. Exit code 1 when a gateway did not confirm."""
+    from appliance.stopping import answer_text
 
     async def go() -> StopAnswer:
         async with FleetClient(where.endpoint()) as client:
             return await client.resume_robots(robots, why=why)
 
     answer = asyncio.run(go())
-    show(answer, as_json=as_json, table=_told(answer))
+    show(answer, as_json=as_json, table=answer_text(answer))
     return Exit.FAILED if answer.silent else Exit.DONE
-
-
-def _told(answer: StopAnswer, *, asked: tuple[str, ...] | None = None) -> str:
-    lines: list[str] = []
-    if asked is not None and (answer.silent or answer.problems):
-        lost = ", ".join(sorted(answer.problems)) or f"gateways {', '.join(answer.silent)}"
-        lines.append(f"NOT CONFIRMED by {lost}: use the switch at the robot if it moves")
-    lines += [f"{', '.join(each.robots) or 'the fleet'}: {each.text}" for each in answer.stops] or [
-        "nothing is stopped"
-    ]
-    if answer.robots:
-        lines.append(f"hold: {', '.join(answer.robots)}")
-    lines += [f"{robot} did not confirm: {reason}" for robot, reason in sorted(answer.problems.items())]
-    lines.append(f"kept by {', '.join(answer.gateways)}")
-    if answer.silent:
-        lines.append(f"no word yet from {', '.join(answer.silent)}")
-    return "\n".join(lines)
 
 
 def standing(*, as_json: Json = False, where: Where = HERE) -> int:

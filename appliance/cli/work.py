@@ -2,7 +2,6 @@
 
 import asyncio
 import signal
-import sys
 import uuid
 from pathlib import Path
 from typing import Annotated
@@ -16,10 +15,9 @@ from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import Endpoint, FleetClient
 from appliance.connection import operator_name
 from appliance.console_watch import stream_line
-from appliance.errors import ConfigError, Exit, NotFoundError, SwiftbotError, UnreachableError
-from appliance.model import PLAIN_PRIORITY, Approval, Plan, TaskRecord, TaskRequest, TaskState
+from appliance.errors import ConfigError, Exit, UnapprovedError
+from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
-from appliance.tasks.api import PlanAnswer
 from appliance.tasks.view import view
 
 task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agree to new plans.", group=WORK)
@@ -60,22 +58,14 @@ def submit(
 ) -> int:
     """Submit an instruction. Returns once planned; --wait follows it.
 
-    On a terminal the plan is shown before it runs, and runs when it is confirmed; in scripts the policy of the fleet
-    decides which plans wait for approval. A text that says to stop ("stop", "halt", "rover_1: stop") is no task: it is
-    the soft stop, at once, of the robots named, else of all.
+    On a terminal the plan is shown before it runs and runs when it is confirmed; in scripts the policy of the fleet
+    decides which plans wait for approval. A text that says to stop ("stop", "halt", "rover_1: stop") is not a task: it
+    is the soft stop, at once, of the robots named, else of all, as `swiftbot stop` does it.
     """
-    from appliance.cli.steer import carry_out_stop
-    from appliance.demo import follow
-    from appliance.llm.stop_words import mentions_stop, stop_request
-
-    if mentions_stop(text) and (stop := stop_request(text, _roster(where))) is not None:
-        return carry_out_stop((*stop.robots, *stop.unknown), why=text, as_json=as_json, where=where)
-    plan = None
-    if not yes and not as_json and sys.stdin.isatty() and sys.stdout.isatty():
-        plan = _confirmed(text, where)
-        if plan is None:
-            console.err.print("nothing was submitted")
-            return Exit.CANCELLED
+    from appliance.cli.steer import said_of_stop, show_stopped
+    from appliance.cli.submitting import Submitting, on_terminal
+    from appliance.llm.stop_words import stop_request
+    from appliance.stopping import Stopped
 
     # The id is chosen here: an interrupt while the task is being handed in must know what to cancel.
     request = TaskRequest(
@@ -86,78 +76,30 @@ def submit(
         deadline_s=deadline,
         group=group,
         approval=approval,
-        plan=plan,
     )
-
-    async def go() -> TaskRecord:
-        async with FleetClient(where.endpoint()) as client:
-            try:
-                accepted = await client.submit(request)
-                console.err.print(f"task {accepted.id} is accepted")
-                planned = await client.planned(accepted.id)
-                if planned.state is TaskState.PROPOSED and planned.proposal is not None:
-                    console.err.print(console.held_text(planned))
-                if not wait:
-                    return planned
-                if not as_json:
-                    return await follow(client, accepted.id)
-                last = accepted
-                async for record in client.watch(accepted.id):
-                    last = record
-            except asyncio.CancelledError:
-                if wait:
-                    await _cancel(client, request.id)
-                raise
-            return last
-
-    record = asyncio.run(go())
-    if as_json or not wait:
-        show(view(record), as_json=as_json, table=console.task_table(record))
-    return _outcome(record)
-
-
-def _roster(where: Where) -> tuple[str, ...]:
-    """The robots that the fleet knows, by which a stop in words names them; none when the fleet does not answer."""
-
-    async def go() -> tuple[str, ...]:
-        async with FleetClient(where.endpoint()) as client:
-            await client.gateway()
-            return tuple(client.plane.registry.robots)
-
-    try:
-        return asyncio.run(go())
-    except UnreachableError:
-        return ()
-
-
-def _confirmed(text: str, where: Where) -> Plan | None:
-    """Show the plan of an instruction on the terminal; it, when the operator wants it to run."""
-
-    async def go() -> PlanAnswer:
-        async with FleetClient(where.endpoint()) as client:
-            with console.err.status("planning"):
-                return await client.plan(text)
-
-    answer = asyncio.run(go())
-    console.out.print(console.plan_answer(answer))
-    return answer.plan if console.asked("run this plan?") else None
-
-
-async def _cancel(client: FleetClient, task: str) -> None:
-    """Cancel a task after an interrupt; that it cannot be done is said, and the command still ends as interrupted."""
-    console.err.print(f"cancelling task {task}")
-    try:
-        await client.cancel(task)
-    except NotFoundError:
-        console.err.print(f"task {task} had not been accepted")
-    except SwiftbotError as error:
-        console.err.print(f"task {task} may go on: {error}", markup=False)
+    shown = not yes and not as_json and on_terminal()
+    with said_of_stop(stop_request(text) is not None):
+        submitting = Submitting(request, where, wait=wait, quiet=as_json)
+        found = submitting.run_shown() if shown else submitting.run()
+    if isinstance(found, Stopped):
+        return show_stopped(found, as_json=as_json)
+    if as_json or not wait or found.state is TaskState.CANCELLED:
+        show(view(found), as_json=as_json, table=console.task_table(found))
+    return _outcome(found)
 
 
 def _outcome(record: TaskRecord) -> int:
+    if record.failure is not None and record.failure.code == UnapprovedError.code:
+        return Exit.REJECTED
+    if record.state in (TaskState.FAILED, TaskState.CANCELLED) and _rejected(record):
+        return Exit.REJECTED
     if record.state is TaskState.FAILED:
         return Exit.REFUSED if record.failure is not None and record.failure.code == "plan" else Exit.FAILED
     return Exit.CANCELLED if record.state is TaskState.CANCELLED else Exit.DONE
+
+
+def _rejected(record: TaskRecord) -> bool:
+    return record.decision is not None and not record.decision.approved
 
 
 @task_app.command(name="list")

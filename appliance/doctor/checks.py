@@ -21,6 +21,7 @@ from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import Engine, PodmanEngine
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue, load_catalogue
+from appliance.skills.sites import load_site
 
 IDS_NEEDED = 65536
 """Subordinate ids of a user: Debian's images use ids to 65534."""
@@ -218,6 +219,23 @@ def check_model(machine: Machine, folder: str) -> Check:
     )
 
 
+def check_fence(name: str) -> Check:
+    """The site's fence: without one a point far outside the site is only refused beyond 200 m."""
+    try:
+        site = load_site(name)
+    except SwiftbotError as error:
+        return Check(name="site", ok=False, detail=error.message, remedy=error.remedy)
+    fence = site.fence
+    extent = f"{fence.x[0]:g} to {fence.x[1]:g} m, {fence.y[0]:g} to {fence.y[1]:g} m" if fence is not None else ""
+    return Check(
+        name="fence",
+        ok=fence is not None,
+        detail=f"{site.name}: {extent}" if fence is not None else f"site {site.name} has none",
+        remedy="add [fence] with name, x and y to the site's file (docs/skills.md, Sites)",
+        required=False,
+    )
+
+
 async def check_session(open_session: Callable[[], Awaitable[Session]]) -> Check:
     """Open a Zenoh session on the loopback and have it answer itself."""
     try:
@@ -258,6 +276,7 @@ def local_checks(machine: Machine, config: GatewayConfig | None) -> list[Check]:
         checks += check_ports(machine, config)
     checks += check_disk(machine, folders)
     checks.append(check_model(machine, config.llm.local_model if config else ""))
+    checks.append(check_fence(config.site if config else "warehouse"))
     return checks
 
 

@@ -10,6 +10,8 @@ from collections.abc import Collection, Generator, Mapping
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError
+from appliance.llm.intake import stop_refused
+from appliance.llm.stop_words import stop_request
 from appliance.model import HIGHEST_PRIORITY, LONGEST_DEADLINE_S, PLAIN_PRIORITY, Plan, TaskRequest
 from appliance.plane.keys import check_name
 from appliance.tasks.bounds import MAX_DEPTH, too_deep
@@ -49,6 +51,16 @@ def checked(request: TaskRequest, config: TasksConfig) -> TaskRequest:
         check_name(name, "gateway")
     task = request.id or f"t-{uuid.uuid4().hex[:10]}"
     return replace(request, instruction=instruction, id=check_name(task, "task"))
+
+
+def refuse_stop(request: TaskRequest, robots: Collection[str]) -> None:
+    """Refuse an instruction that is a soft stop: an operator's tool carries it out, and nobody else may order it.
+
+    Raises:
+        RefusedError: it is one, with the command.
+    """
+    if request.plan is None and (stop := stop_request(request.instruction, tuple(robots))) is not None:
+        raise stop_refused(stop)
 
 
 class Ends:

@@ -20,8 +20,6 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.llm.cascade import Decomposer
-from appliance.llm.intake import stop_refused
-from appliance.llm.stop_words import stop_request
 from appliance.model import (
     Group,
     Plan,
@@ -38,7 +36,7 @@ from appliance.plane.keys import run_of
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue, SkillManifest
 from appliance.tasks import machine, resolve
-from appliance.tasks.admission import Admission, checked, expectation, longest_s
+from appliance.tasks.admission import Admission, checked, expectation, longest_s, refuse_stop
 from appliance.tasks.api import (
     ExperienceAsk,
     PlanAsk,
@@ -196,12 +194,11 @@ class TaskManager:
 
         Raises:
             PayloadError: empty or oversize instruction, bad id.
-            RefusedError: the coordinator is full.
+            RefusedError: it is a stop; the coordinator is full.
             UnreachableError: no owner could be reached within the time allowed.
         """
         request = checked(request, self.config)
-        if request.plan is None and (stop := stop_request(request.instruction, tuple(self.plane.registry.robots))):
-            raise stop_refused(stop)
+        refuse_stop(request, self.plane.registry.robots)
         until = time.monotonic() + 5.0
         while True:
             owner = ""

@@ -54,7 +54,13 @@ class SwiftbotApp(Ordering):
             if record.approval is Approval.ALWAYS:
                 self.push_screen(ReviewScreen(record.id))
 
-        dialog = SubmitDialog(self.view, self.history, instruction=given.get("instruction", ""), own=self.config.keys)
+        dialog = SubmitDialog(
+            self.view,
+            self.history,
+            instruction=given.get("instruction", ""),
+            own=self.config.keys,
+            stops=self.stops_in_words,
+        )
         self.push_screen(dialog, submitted)
 
     def do_review(self, given: Mapping[str, str]) -> None:

@@ -8,6 +8,7 @@ from textual.css.query import NoMatches
 from textual.widgets import Input
 
 from appliance.errors import SwiftbotError, UnreachableError
+from appliance.llm.stop_words import stop_request
 from appliance.model import TaskRecord
 from appliance.tui import actions, grammar, themes
 from appliance.tui.data import View
@@ -15,11 +16,15 @@ from appliance.tui.dialogs import ConfirmDialog, TextDialog
 from appliance.tui.frame import FleetScreen
 from appliance.tui.grammar import Command
 from appliance.tui.keys import PROMPTS
+from appliance.tui.robots.actions import STOP_IN_WORDS
 from appliance.tui.safe import safe
 from appliance.tui.shell import Shell
 from appliance.tui.tasks.facts import state_cell
 
 log = structlog.get_logger(__name__)
+
+_UNSAID = ("stops", "robots", "unknown", "roster")
+"""Arguments that nobody has written."""
 
 
 class Ordering(Shell):
@@ -58,6 +63,8 @@ class Ordering(Shell):
     def begin(self, command: Command) -> None:
         """Do an action, unless something is missing, the UI is read-only, or a person says no."""
         action = command.action
+        if action.call == "submit" and self.stops_in_words(command.given.get("instruction", "")):
+            return
         if action.writes and not (action.always and self._steered.steerable) and not self._allowed():
             return
         if command.missing:
@@ -77,6 +84,16 @@ class Ordering(Shell):
             self.push_screen(ConfirmDialog(safe(action.sentence(command.given))), answered)
         else:
             self.carry_out(command)
+
+    def stops_in_words(self, text: str) -> bool:
+        """Carry a text out that is a soft stop, as the stop key does it, read-only as well; False when it is none."""
+        view = self._steered
+        roster = tuple(view.store.robots)
+        if not view.steerable or (stop := stop_request(text, roster)) is None:
+            return False
+        given = {"robots": "/".join(stop.robots), "unknown": "/".join(stop.unknown), "roster": "/".join(roster)}
+        self.carry_out(Command(action=STOP_IN_WORDS, given={**given, "why": text}))
+        return True
 
     def _allowed(self) -> bool:
         if not self.view.steerable:
@@ -117,7 +134,7 @@ class Ordering(Shell):
 
     def carry_out(self, command: Command) -> None:
         """Ask something of the fleet in the background, and show what comes of it."""
-        words = (word for name, word in command.given.items() if name != "stops")
+        words = (word for name, word in command.given.items() if name not in _UNSAID)
         line = " ".join([command.action.name, *words])
         if line in self.under_way:
             self.notify(f"{safe(line, 80)}: under way already", severity="warning", markup=False)

@@ -19,6 +19,7 @@ from appliance.errors import (
     RobotError,
     SwiftbotError,
     TakenError,
+    UnapprovedError,
     UnreachableError,
     from_code,
 )
@@ -37,6 +38,7 @@ ENDS = {
     PoolError: Exit.FAILED,
     RobotError: Exit.FAILED,
     TakenError: Exit.REFUSED,
+    UnapprovedError: Exit.REJECTED,
     RecordError: Exit.FAILED,
     CancelledByOperatorError: Exit.CANCELLED,
 }

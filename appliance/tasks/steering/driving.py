@@ -11,7 +11,7 @@ from typing import Any
 
 import structlog
 
-from appliance.errors import NotFoundError, PlanError, SwiftbotError, UnreachableError
+from appliance.errors import NotFoundError, PlanError, SwiftbotError, UnapprovedError, UnreachableError
 from appliance.model import Decision, Failure, Pause, SubtaskRecord, TaskRecord, TaskState, Word
 from appliance.tasks import machine
 from appliance.tasks.bounds import MAX_NOTE, clean
@@ -95,7 +95,7 @@ class Steering:
             waited_s = self._keeper.elapsed_s - proposal.since_s
             if waited_s > proposal.expires_s:
                 failure = Failure(
-                    code="refused",
+                    code=UnapprovedError.code,
                     message=f"no operator approved its plan within {proposal.expires_s:.0f} s",
                     remedy=f"hand it in again, or `swiftbot task retry {record.id}`",
                 )

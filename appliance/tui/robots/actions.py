@@ -1,6 +1,9 @@
 """What can be done with robots: taking one over, answering what it asks, stopping them and letting them go."""
 
 from appliance.client import FleetClient
+from appliance.errors import RefusedError
+from appliance.model.steering import MAX_WHY
+from appliance.stopping import unknown_text
 from appliance.tui.action import WHY, Action, Given, Parameter
 from appliance.tui.safe import safe
 
@@ -28,13 +31,22 @@ async def stop_one(fleet: FleetClient, given: Given, _by: str) -> str:
     return await stop_these(fleet, (given["robot"],), given.get("why", ""))
 
 
+async def stop_in_words(fleet: FleetClient, given: Given, _by: str) -> str:
+    """Stop the robots that an instruction names, or all; a name that no robot has stops none, and is reported first."""
+    robots, unknown, roster = (tuple(filter(None, given[name].split("/"))) for name in ("robots", "unknown", "roster"))
+    lost = [unknown_text(name, roster) for name in unknown]
+    if lost and not robots:
+        raise RefusedError("; ".join(lost), remedy="F8 or :stop stops all robots")
+    return "; ".join([*lost, await stop_these(fleet, robots, given["why"][:MAX_WHY])])
+
+
 async def stop_these(fleet: FleetClient, robots: tuple[str, ...], why: str) -> str:
     """Stop robots, or all when none is named; return who holds and who does not."""
     answer = await fleet.stop(robots, why=why)
     held = f"holding: {', '.join(answer.robots)}" if answer.robots else "no robot has confirmed yet"
     problems = "".join(f"; NOT {name}: {why}" for name, why in sorted(answer.problems.items()))
     silent = f"; not confirmed by {', '.join(answer.silent)}" if answer.silent else ""
-    return f"soft stop of {robots[0] if robots else 'the fleet'}: {held}{problems}{silent}"
+    return f"soft stop of {', '.join(robots) or 'the fleet'}: {held}{problems}{silent}"
 
 
 async def resume_robots(fleet: FleetClient, given: Given, _by: str) -> str:
@@ -128,3 +140,13 @@ ROBOTS: tuple[Action, ...] = (
         do=resume_robots,
     ),
 )
+
+STOP_IN_WORDS = Action(
+    name="stop",
+    title="STOP",
+    help="Soft stop of the robots that an instruction says to stop",
+    writes=True,
+    always=True,
+    do=stop_in_words,
+)
+"""What becomes of an instruction that is a stop; it is no command of its own."""

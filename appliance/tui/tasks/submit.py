@@ -1,7 +1,7 @@
 """Takes an instruction, with history and completion of names, shows its plan, and submits exactly that plan."""
 
 import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from rich.text import Text
 from textual import on, work
@@ -12,9 +12,7 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, Static
 
 from appliance.errors import PlanError, SwiftbotError
-from appliance.llm.stop_words import stop_request
 from appliance.model import Approval, Site, TaskRecord, TaskRequest
-from appliance.stopping import unknown_text
 from appliance.tasks.api import PlanAnswer
 from appliance.tui.action import key_name
 from appliance.tui.data import View
@@ -22,7 +20,6 @@ from appliance.tui.keys import DIALOG_KEYS
 from appliance.tui.plans import shape
 from appliance.tui.plans.completing import common, completions
 from appliance.tui.plans.history import History
-from appliance.tui.robots.actions import stop_these
 from appliance.tui.safe import safe
 from appliance.tui.tasks.facts import plan_lines
 from appliance.tui.widgets import Field, Pane
@@ -118,9 +115,25 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
     ]
 
     def __init__(
-        self, view: View, history: History, *, instruction: str = "", own: Mapping[str, str] | None = None
+        self,
+        view: View,
+        history: History,
+        *,
+        instruction: str = "",
+        own: Mapping[str, str] | None = None,
+        stops: Callable[[str], bool] = lambda _: False,
     ) -> None:
+        """Make the dialog.
+
+        Args:
+            view: the fleet.
+            history: earlier instructions.
+            instruction: what stands in it at first.
+            own: the operator's own keys.
+            stops: carries a text out that is a soft stop; False when it is none.
+        """
         super().__init__()
+        self._stops = stops
         key = (own or {}).get("edit-first", DIALOG_KEYS["edit-first"]).split(",")[0].strip()
         self._may = _REVIEW.format(key=key_name(key))
         self._view = view
@@ -170,14 +183,14 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
 
     @on(Input.Submitted, "#instruction")
     def entered(self, event: Input.Submitted) -> None:
-        """Plan the instruction, or run the plan that is shown for it."""
+        """Plan the instruction, or run the plan that is shown for it; a stop is carried out at once."""
         instruction = event.value.strip()
-        if self._busy:
-            return
-        if not instruction:
+        if self._stops(instruction):
+            self.action_leave()
+        elif self._busy:
+            pass
+        elif not instruction:
             self._show(Text("Write an instruction first.", "yellow"), _ASK)
-        elif (stop := stop_request(instruction, sorted(self._view.store.robots))) is not None:
-            self._stop(stop.robots, stop.unknown, instruction)
         elif self._answer is None:
             self._plan(instruction)
         else:
@@ -187,21 +200,6 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         """Submit the plan so that it waits: it is edited and approved on a screen of its own."""
         if self._answer is not None and not self._busy:
             self._submit(self._planned, self._answer, Approval.ALWAYS)
-
-    @work(exclusive=True)
-    async def _stop(self, robots: tuple[str, ...], unknown: tuple[str, ...], instruction: str) -> None:
-        """A text that says to stop is the soft stop, at once; it is no task."""
-        self._busy = True
-        roster = sorted(self._view.store.robots)
-        text = Text("".join(f"{safe(unknown_text(name, roster))}\n" for name in unknown), "red")
-        try:
-            if robots or not unknown:
-                text.append(await stop_these(self._view.orders, robots, instruction), "bold red")
-        except SwiftbotError as error:
-            text.append(f"✘ {safe(error.message)}\n→ {safe(error.remedy)}", "red")
-        finally:
-            self._busy = False
-        self._show(text, "Esc leaves")
 
     @work(exclusive=True)
     async def _plan(self, instruction: str) -> None:

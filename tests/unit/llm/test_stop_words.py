@@ -326,6 +326,7 @@ def _cases(text: str, between: str = "\n") -> list[str]:
 
 @pytest.mark.parametrize("text", _cases(FLEET))
 def test_stops_of_the_fleet(text: str) -> None:
+    """Stops of the fleet."""
     for robots in (ROBOTS, ()):
         found = stop_request(text, robots)
         assert found == StopRequest()
@@ -334,31 +335,37 @@ def test_stops_of_the_fleet(text: str) -> None:
 
 @pytest.mark.parametrize("text", NAMED)
 def test_stops_of_robots(text: str) -> None:
+    """Stops of robots."""
     assert stop_request(text, ROBOTS) == StopRequest(robots=NAMED[text])
 
 
 @pytest.mark.parametrize("text", UNKNOWN)
 def test_names_that_no_robot_has_are_reported(text: str) -> None:
+    """Names that no robot has are reported."""
     robots, unknown = UNKNOWN[text]
     assert stop_request(text, ROBOTS) == StopRequest(robots=robots, unknown=unknown)
 
 
 @pytest.mark.parametrize("text", _cases(NO_STOP))
 def test_what_only_looks_like_a_stop(text: str) -> None:
+    """What only looks like a stop."""
     assert stop_request(text, ROBOTS) is None
     assert stop_request(text, ()) is None
 
 
 def test_there_are_enough_cases() -> None:
+    """There are enough cases."""
     assert len(_cases(FLEET)) + len(NAMED) >= 60
     assert len(_cases(NO_STOP)) >= 60
 
 
 def test_a_line_is_a_sentence() -> None:
+    """A line is a sentence."""
     assert stop_request("Rover_1 go to dock 1\nstop", ROBOTS) == StopRequest()
 
 
 def test_a_robot_of_another_kind_of_name() -> None:
+    """A robot of another kind of name."""
     assert stop_request("stop alpha", ("alpha", "beta")) == StopRequest(robots=("alpha",))
     assert stop_request("stop alhpa", ("alpha", "beta")) == StopRequest(unknown=("alhpa",))
     assert stop_request("stop delivery bot 2", ("delivery_bot_2",)) == StopRequest(robots=("delivery_bot_2",))
@@ -370,6 +377,7 @@ def test_a_robot_of_another_kind_of_name() -> None:
 
 
 def test_an_unknown_roster_keeps_the_names() -> None:
+    """An unknown roster keeps the names."""
     assert stop_request("rover_1 stop", ()) == StopRequest(unknown=("rover1",))
 
 
@@ -400,18 +408,21 @@ def _cased(word: str, choices: list[bool]) -> str:
 def test_a_stop_word_alone_is_a_stop(
     word: str, cases: list[bool], before: str, left: str, after: str, right: str, with_roster: bool
 ) -> None:
+    """In any case, between any marks and blanks."""
     text = f"{before}{left} {_cased(word, cases)} {right}{after}"
     assert stop_request(text, ROBOTS if with_roster else ()) == StopRequest()
 
 
 @given(st.sampled_from(WORDS), st.sampled_from(['""', "“”", "«»", "„“", "''", "‘’"]), st.sampled_from(["", " ", "!"]))
 def test_a_quoted_stop_word_is_none(word: str, quotes: str, mark: str) -> None:
+    """A quoted stop word is none."""
     assert stop_request(f"{quotes[0]}{word}{mark.strip()}{quotes[1]}{mark}", ROBOTS) is None
     assert stop_request(f"Rover_1: say {quotes[0]}{word}{quotes[1]}", ROBOTS) is None
 
 
 @given(st.sampled_from(WORDS), st.sampled_from(OBJECTS), st.sampled_from(["", ".", "!"]))
 def test_a_stop_word_with_another_object_is_none(word: str, what: str, mark: str) -> None:
+    """A stop word with another object is none."""
     assert stop_request(f"{word} {what}{mark}", ROBOTS) is None
 
 
@@ -419,6 +430,7 @@ def test_a_stop_word_with_another_object_is_none(word: str, what: str, mark: str
     st.text() | st.text("stop halt rover_1 \"'“”.,!?;:-§no", max_size=200), st.lists(st.text(max_size=12), max_size=6)
 )
 def test_it_never_raises(text: str, robots: list[str]) -> None:
+    """It never raises."""
     found = stop_request(text, robots)
     assert found is None or set(found.robots) <= set(robots)
     mentions_stop(text)
@@ -426,6 +438,7 @@ def test_it_never_raises(text: str, robots: list[str]) -> None:
 
 @given(st.text(string.ascii_letters + " \"'", max_size=60))
 def test_what_is_a_stop_mentions_one(text: str) -> None:
+    """What is a stop mentions one."""
     assert mentions_stop(text) or stop_request(text, ROBOTS) is None
 
 
@@ -437,6 +450,7 @@ def test_what_is_a_stop_mentions_one(text: str) -> None:
     ],
 )
 def test_long_texts_take_linear_time(part: str) -> None:
+    """Long texts take linear time."""
     roster = tuple(f"rover_{each}" for each in range(300))
     text = (part * (100_000 // len(part) + 1))[:100_000]
     stop_request("stop", roster)

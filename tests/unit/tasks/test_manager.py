@@ -14,6 +14,7 @@ from appliance.client import _news
 from appliance.errors import DeadlineError, PayloadError, RefusedError, UnreachableError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.experience.statistic import Experience
+from appliance.llm.review import Review
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.model import (
@@ -33,7 +34,6 @@ from appliance.model import (
     TaskState,
     encode,
 )  # fmt: skip
-from appliance.llm.review import Review
 from appliance.model.tasks import LostRun
 from appliance.plane.dht import Record
 from appliance.pool.api import Hinted

@@ -28,6 +28,7 @@ from appliance.tui.grid import Grid
 from appliance.tui.keys import keymap
 from appliance.tui.replay.source import ReplayView
 from appliance.tui.settings import TuiConfig
+from appliance.tui.tasks.submit import SubmitDialog
 
 from .pictures import characters, settle
 
@@ -446,3 +447,31 @@ async def test_gateway_is_drilled_into_and_left(view: "FakeView") -> None:
         assert "podman.socket is absent" in await settle(app, pilot)
         await pilot.press("1")
         assert "› gw-b" not in (await settle(app, pilot)).split("\n")[1]
+
+
+async def test_a_stop_in_words_stops(view: "FakeView") -> None:
+    """In the dialog of instructions, and on the command line read-only too, a text that says to stop is the stop."""
+    view.orders.answers["stop"] = StopAnswer(stops=(), robots=("drone-1",))
+    app = SwiftbotApp(view, TuiConfig(write=True))
+    async with app.run_test(size=(120, 30), notifications=True) as pilot:
+        await pilot.press("s")
+        await pilot.pause()
+        await pilot.press(*"STOP!", "enter")
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert not isinstance(app.screen, SubmitDialog)
+        assert view.orders.of("stop") == [((),)]
+        assert view.orders.options["stop"] == {"why": "STOP!"}
+        assert "holding: drone-1" in characters(app)
+        app.unlocked = False
+        app.run_line("submit drone 1: stop")
+        await app.workers.wait_for_complete()
+        assert view.orders.of("stop")[1:] == [(("drone-1",),)]
+        app.run_line("submit drone-1: go to gate")
+        app.run_line("submit stop drone-7")
+        await app.workers.wait_for_complete()
+        await pilot.pause()
+        assert "NOT STOPPED: no robot 'drone7'" in " ".join(characters(app).split())
+        assert len(view.orders.of("stop")) == 2
+        assert not view.orders.of("plan")
+        assert not view.orders.of("submit")
