@@ -26,7 +26,7 @@ from appliance.llm.experience.memory import Memory
 from appliance.llm.figures import Figures
 from appliance.llm.intake import explained, no_plan, refused, stop_refused
 from appliance.llm.peers import ProposeAsk, Proposed
-from appliance.llm.review import Facts, Review, review
+from appliance.llm.review import Facts, Review, reasons, review
 from appliance.llm.routing.budget import Budget
 from appliance.llm.routing.canonical import catalogue_digest, digest, plan_key
 from appliance.llm.routing.gate import Gate
@@ -351,7 +351,11 @@ class Decomposer:
         if best is not None:
             attempts[best.index] = msgspec.structs.replace(attempts[best.index], ok=True)
             return best.found(attempts)
-        raise no_plan(attempts, explained(context.instruction), refusals)
+        # The words themselves first: "every 10 minutes" is the reason, not the place that a planner took it for.
+        told = [each for each in refusals if each.check in ("negation", "polarity", "time")]
+        named = {each.check for each in told}
+        real = [*told, *(each for each in reasons(context, self._catalogue) if each.check not in named), *refusals]
+        raise no_plan(attempts, explained(context.instruction), real)
 
     async def _ask(
         self, slot: Slot, context: PlanContext, judge: Judge, refusals: list[Finding]

@@ -18,7 +18,10 @@ from appliance.llm.checks.finding import Facts
 from appliance.llm.checks.grounding import ungrounded
 from appliance.llm.checks.policy import policy_holds, unsafe
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
-from appliance.model import Finding, Severity, Verdict
+from appliance.llm.safety.settings import SafetyConfig
+from appliance.llm.settings import PlanContext
+from appliance.model import Finding, Plan, Severity, Verdict
+from appliance.skills.catalogue import Catalogue
 
 __all__ = ["CHECKS", "Check", "Facts", "Review", "review"]
 
@@ -95,6 +98,20 @@ def _accounted(facts: Facts, found: Sequence[Finding]) -> float:
     if facts.continued or any(each.severity is not Severity.NOTE and each.check not in INTRINSIC for each in found):
         return facts.confidence
     return round(ACCOUNTED + (1 - ACCOUNTED) * facts.confidence, 4)
+
+
+def reasons(context: PlanContext, catalogue: Catalogue) -> tuple[Finding, ...]:
+    """Return what of an instruction no plan of any planner accounts for: the real reason where none had a plan."""
+    empty = Facts(Plan(domain="", subtasks=()), context, catalogue, SafetyConfig())
+    checks = (
+        wording.time,
+        wording.negation,
+        wording.exception,
+        wording.condition,
+        wording.alternative,
+        wording.question,
+    )
+    return tuple(each for check in checks for each in check(empty) if each.severity is not Severity.NOTE)
 
 
 def _refusing(name: str, problems: Callable[[Facts], Iterable[str]]) -> Callable[[Facts], Iterable[Finding]]:
