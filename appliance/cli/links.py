@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
 
 from appliance.robots.api import LinkFacts, LinkList
@@ -16,14 +15,14 @@ def links_tables(found: Mapping[str, LinkList]) -> Group:
     routes = Table("gateway", "sender", "was heard last on", box=None)
     for name, each in sorted(found.items()):
         for link in each.links:
-            links.add_row(name, escape(link.url), str(len(link.ends)), *_figures(link), escape(_note(link)))
+            links.add_row(name, link.url, str(len(link.ends)), *_figures(link), _note(link))
             for one in link.senders:
                 senders.add_row(
-                    name, escape(link.url), f"{one.system}/{one.component}", f"{one.received:,}", f"{one.lost:,}",
+                    name, link.url, f"{one.system}/{one.component}", f"{one.received:,}", f"{one.lost:,}",
                     f"{one.loss:.1%}", str(one.late), str(one.repeated), f"{one.silent_s:g}",
                 )  # fmt: skip
         for sender, where in each.routes.items():
-            routes.add_row(name, sender, escape(where))
+            routes.add_row(name, sender, where)
     return Group(*(each for each in (links, senders, routes) if each is links or each.row_count))
 
 

@@ -1,7 +1,6 @@
 """Records as tables: `swiftbot plane get` and `ls`."""
 
 import msgspec
-from rich.markup import escape
 from rich.table import Table
 
 from appliance.plane.browsing import Copy, RecordPlace
@@ -11,18 +10,18 @@ from appliance.records import Held
 
 def place_table(record: Record, place: RecordPlace, how: str) -> Table:
     """A record's version, and its copies."""
-    title = f"{escape(record.key)} at {escape(_version(record.version))}, read from {how}; owner {escape(place.owner)}"
+    title = f"{record.key} at {_version(record.version)}, read from {how}; owner {place.owner}"
     table = Table(title=title, title_justify="left", caption=_caption(place), caption_justify="left")
     for name in ("gateway", "version", "bytes", "state"):
         table.add_column(name)
     for each in place.copies:
-        table.add_row(escape(each.gateway), escape(_version(each.version)), str(each.size_bytes), escape(_state(each)))
+        table.add_row(each.gateway, _version(each.version), str(each.size_bytes), _state(each))
     return table
 
 
 def _caption(place: RecordPlace) -> str:
     voters = f"voters: {', '.join(place.voters)}" if place.voters else "no quorum: plane.voters is empty"
-    return escape(f"{'the copies agree' if place.agree else 'the copies differ'}; {voters}")
+    return f"{'the copies agree' if place.agree else 'the copies differ'}; {voters}"
 
 
 def held_table(held: list[Held]) -> Table:
@@ -35,7 +34,7 @@ def held_table(held: list[Held]) -> Table:
         copies = ", ".join(copy.gateway for copy in each.copies)
         notes = [*(["removed"] if newest.deleted else []), *([] if each.agree else ["copies differ"])]
         row = (each.key, _version(newest.version), str(newest.size_bytes), each.owner, copies, ", ".join(notes))
-        table.add_row(*(escape(cell) for cell in row))
+        table.add_row(*(cell for cell in row))
     return table
 
 

@@ -432,6 +432,12 @@ def _mistyped(tokens: Sequence[str], at: int, roster: _Roster, heard: _Heard, bu
     for length in (3, 2, 1):
         parts = tokens[at : at + length]
         said = "".join(parts)
+        # "bob rover 2" is no name: a robot or a known word begins within it.
+        if any(
+            _known(tokens, at + ahead)[0] or _named(tokens, at + ahead, roster, _Heard())
+            for ahead in range(1, len(parts))
+        ):
+            continue
         if len(parts) < length or "," in parts or "§" in parts or not 3 <= len(said) <= 40 or budget.left <= 0:
             continue
         budget.left -= 1
