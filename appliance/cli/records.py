@@ -34,7 +34,7 @@ def held_table(held: list[Held]) -> Table:
         copies = ", ".join(copy.gateway for copy in each.copies)
         notes = [*(["removed"] if newest.deleted else []), *([] if each.agree else ["copies differ"])]
         row = (each.key, _version(newest.version), str(newest.size_bytes), each.owner, copies, ", ".join(notes))
-        table.add_row(*(cell for cell in row))
+        table.add_row(*row)
     return table
 
 

@@ -110,6 +110,17 @@ async def test_a_known_id_is_the_same_task_and_is_driven(manager: TaskManager, p
     await until(lambda: manager.unfinished == 1)
 
 
+@pytest.mark.parametrize("submitter", ["", "ann", "rover_1"])
+@pytest.mark.parametrize("text", ["stop", "HALT!", "rover_1: stop"])
+async def test_a_stop_is_no_task(manager: TaskManager, plane: Any, text: str, submitter: str) -> None:
+    """Whoever hands it in: an operator's tool carries it out, robots and scripts are told the command."""
+    with pytest.raises(RefusedError, match="this is a stop, not a task") as refused:
+        await manager.submit(TaskRequest(instruction=text, submitter=submitter))
+    assert refused.value.remedy.startswith("swiftbot stop")
+    assert manager.unfinished == 0
+    assert not plane.dht.records
+
+
 async def test_an_undriven_task_is_taken_up_without_a_ring_change(
     manager: TaskManager, plane: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

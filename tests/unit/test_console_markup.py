@@ -1,0 +1,163 @@
+"""Text of users and robots is printed as it is: brackets are no markup, colons no emoji, whatever table it is in."""
+
+import types
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from msgspec import Struct
+
+from appliance import cli, console, reasons
+from appliance.cli import links, records, steer
+from appliance.console_plan import analysis_text, experience_table, provenance_text
+from appliance.console_watch import revision_lines, stream_line
+from appliance.errors import RefusedError
+from appliance.llm.analysis import Analysis
+from appliance.model import (
+    Act,
+    ContainerInfo,
+    Enquiry,
+    GatewayStatus,
+    Lease,
+    Provenance,
+    RobotInfo,
+    SoftStop,
+    TaskRecord,
+)
+from appliance.plane.browsing import RecordPlace
+from appliance.plane.versions import Record
+from appliance.pool.api import Evicted, PoolDecision
+from appliance.pool.images import ImageState
+from appliance.records import Held
+from appliance.robots.api import LinkList
+from appliance.robots.authority.api import StopAnswer
+from appliance.stopping import Stopped
+from appliance.tasks.api import ExperienceList, PlanAnswer
+from appliance.tasks.watch.lines import Line
+from appliance.tasks.why import TaskWhy
+
+CRASHES = '[/red] x" [bold]b[/] [link=x] [/] \\[a] :warning: [@click=f]'
+
+
+def filled(kind: Any, text: str, depth: int = 0) -> Any:
+    """Return a value of a type, with a text in every place that takes one."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return filled(arguments[0], text, depth)
+    if origin in (Union, types.UnionType):
+        return filled(next(each for each in arguments if each is not type(None)), text, depth)
+    if origin is Literal:
+        return arguments[0]
+    if origin in (tuple, list, frozenset):
+        return () if depth > 8 else origin([filled(arguments[0], text, depth + 1)])
+    if origin in (dict, Mapping):
+        return {filled(arguments[0], text, depth + 1): filled(arguments[1], text, depth + 1)}
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        hints = get_type_hints(kind, include_extras=True)
+        return kind(**{name: filled(hints[name], text, depth + 1) for name in kind.__struct_fields__})
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return next(iter(kind))
+    plain: dict[Any, Any] = {bool: True, int: 1, float: 1.0, bytes: text.encode(), msgspec.Raw: msgspec.Raw(b"1")}
+    return plain.get(kind, text)
+
+
+def of(kind: Any, show: Callable[[Any], Any]) -> Callable[[str], Any]:
+    """Return what makes a table of a filled value."""
+    return lambda text: show(filled(kind, text))
+
+
+SHOWN: dict[str, Callable[[str], Any]] = {
+    "task": of(TaskRecord, console.task_table),
+    "tasks": of(tuple[TaskRecord, ...], console.task_list),
+    "held": of(TaskRecord, console.held_text),
+    "revisions": of(TaskRecord, lambda record: console.Group(*revision_lines(record))),
+    "progress": of(TaskRecord, lambda record: console.progress_line(record.subtasks[0])),
+    "plan": of(PlanAnswer, console.plan_answer),
+    "provenance": of(Provenance, provenance_text),
+    "analysis": of(Analysis, analysis_text),
+    "experience": of(ExperienceList, experience_table),
+    "why": of(TaskWhy, reasons.why_text),
+    "line": of(Line, stream_line),
+    "gateways": of(tuple[GatewayStatus, ...], console.gateway_table),
+    "containers": of(tuple[ContainerInfo, ...], console.container_table),
+    "decisions": lambda text: console.decision_table([(text, filled(PoolDecision, text))]),
+    "evicted": of(dict[str, Evicted], console.evicted_text),
+    "images": of(tuple[ImageState, ...], console.image_table),
+    "robots": of(tuple[RobotInfo, ...], console.robot_table),
+    "links": of(dict[str, LinkList], links.links_tables),
+    "held records": of(list[Held], records.held_table),
+    "place": lambda text: records.place_table(filled(Record, text), filled(RecordPlace, text), text),
+    "stop": of(StopAnswer, lambda answer: Stopped(unknown=("[/red]",), answer=answer).text()),
+}
+
+
+def printed(value: Any) -> str:
+    """Return what the console prints, without line breaks and blanks."""
+    before = console.out.width
+    console.out.width = 100_000
+    try:
+        with console.out.capture() as capture:
+            console.out.print(value)
+    finally:
+        console.out.width = before
+    return "".join(capture.get().split())
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_brackets_are_printed_as_they_are(name: str) -> None:
+    """No table is broken by them, and none loses any of it."""
+    assert "".join(CRASHES.split())[:30] in printed(SHOWN[name](CRASHES))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.text("[]/\\:@=ab red", max_size=20) | st.text(max_size=20))
+def test_no_text_breaks_a_table(text: str) -> None:
+    """Whatever brackets, marks and letters it is made of."""
+    for show in SHOWN.values():
+        printed(show(text))
+
+
+class Steered:
+    """A fleet whose audit, stops and questions hold the text."""
+
+    async def __aenter__(self) -> "Steered":
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Nothing is open."""
+
+    async def acts(self, limit: int) -> Any:
+        """Return one order, and a gateway that does not tell."""
+        del limit
+        return (filled(Act, CRASHES),), {CRASHES: RefusedError(CRASHES, remedy=CRASHES)}
+
+    async def standing(self) -> Any:
+        """Return one of each."""
+        return types.SimpleNamespace(active=(filled(SoftStop, CRASHES),), leases=(filled(Lease, CRASHES),))
+
+    async def enquiries(self) -> Any:
+        """Return one, and a gateway that does not tell."""
+        return types.SimpleNamespace(enquiries=(filled(Enquiry, CRASHES),), unreachable=(CRASHES,))
+
+    async def stop(self, robots: Any, *, why: str) -> Any:
+        """Refuse it."""
+        raise RefusedError(f"{robots} {why} {CRASHES}", remedy=CRASHES)
+
+
+@pytest.mark.parametrize(
+    ("words", "code"), [(["acts"], 0), (["standing"], 0), (["asks"], 0), (["stop", "--why", CRASHES], 4)]
+)
+def test_commands_print_it_as_it_is(
+    words: list[str], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Orders, stops, questions and errors, too."""
+    monkeypatch.setattr(steer, "FleetClient", lambda _: Steered())
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*words, "--connect", "tcp/127.0.0.1:1"])
+    said = capsys.readouterr()
+    assert ended.value.code == code
+    assert "".join(CRASHES.split()) in "".join((said.out + said.err).split())
