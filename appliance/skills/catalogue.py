@@ -123,7 +123,8 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     migratable: Literal["", "anytime", "between commands", "never"] = ""
     """When a run may migrate to another gateway. Empty: `anytime`, or `never` if it sends robot commands."""
     opposite_of: tuple[Word, ...] = ()
-    """Skills that undo it: an order for one is never carried out by the other."""
+    """Skills that undo it: an order for one is never carried out by the other. Of two in one folder of skills each
+    names the other; what a site's skill says of a built-in one is added to that one."""
     moves_robot: bool = False
     """Whether a run takes the robot's body elsewhere, up and down too."""
     joint: bool = False
@@ -134,6 +135,10 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Whether a plan may well have it twice with the same parameters though the words do not say "twice"."""
     reports: bool = False
     """Whether it only tells somebody something: nothing moves, so a condition before it needs no wait."""
+    observes: bool = False
+    """Whether its result says how something is, so that a condition behind it is about that result."""
+    incidental: bool = False
+    """Whether a plan is about its other subtasks, where it has some: this one is the way there, or reports on them."""
     feeds_on: tuple[Word, ...] = ()
     """Skills whose output it works on, wherever a plan has one."""
     at_object: Word | Literal[""] = ""
@@ -227,6 +232,7 @@ def _load(extra: tuple[Path, ...]) -> Catalogue:
         for other in spec.compatible:
             if other not in images:
                 raise _wrong(spec.folder / "image.toml", "compatible", f"there is no image {other!r}")
+    origin: dict[str, Path] = {}
     for root in roots:
         for manifest in _manifests(root):
             file = manifest.folder / "skill.toml"
@@ -237,9 +243,11 @@ def _load(extra: tuple[Path, ...]) -> Catalogue:
                     file, "image", f"there is no image {manifest.image!r} (known: {', '.join(sorted(images))})"
                 )
             skills[manifest.id] = manifest
+            origin[manifest.id] = root
     for manifest in skills.values():
         _check_alternatives(manifest, skills)
-        _check_facts(manifest, skills)
+        _check_facts(manifest, skills, origin)
+    skills = _with_opposites(skills)
     ordered = sorted(skills.values(), key=lambda each: (DOMAINS.index(each.domain), each.id))
     return Catalogue(DOMAINS, {each.id: each for each in ordered}, images)
 
@@ -302,7 +310,7 @@ def _check_alternatives(manifest: SkillManifest, skills: dict[str, SkillManifest
                 raise _wrong(file, "alternatives", f"{other.id} needs {name}: map it in `params`")
 
 
-def _check_facts(manifest: SkillManifest, skills: dict[str, SkillManifest]) -> None:
+def _check_facts(manifest: SkillManifest, skills: dict[str, SkillManifest], origin: dict[str, Path]) -> None:
     """Check what a manifest says of other skills, and of its own parameters."""
     file = manifest.folder / "skill.toml"
     for key, others in (("opposite_of", manifest.opposite_of), ("feeds_on", manifest.feeds_on)):
@@ -310,15 +318,33 @@ def _check_facts(manifest: SkillManifest, skills: dict[str, SkillManifest]) -> N
             if other not in skills or other == manifest.id:
                 raise _wrong(file, key, f"{other!r} is no other skill")
     for other in manifest.opposite_of:
-        if manifest.id not in skills[other].opposite_of:
+        if manifest.id not in skills[other].opposite_of and origin[other] == origin[manifest.id]:
             raise _wrong(file, "opposite_of", f"{other!r} does not name {manifest.id!r} in its own")
-    if manifest.at_object and manifest.at_object not in manifest.params:
-        raise _wrong(file, "at_object", f"{manifest.at_object!r} is none of its parameters")
-    if manifest.joint and "robots" not in manifest.params:
-        raise _wrong(file, "joint", "needed with it: a parameter robots")
+    if manifest.moves_robot and "base" not in manifest.uses:
+        raise _wrong(file, "moves_robot", "what moves the robot's body has base in `uses`")
+    if manifest.flying and manifest.runs != "robot":
+        raise _wrong(file, "flying", "a skill that runs on no robot needs none that flies")
+    if manifest.reports and (manifest.moves_robot or manifest.danger):
+        raise _wrong(file, "reports", "what only informs somebody moves nothing and is harmless")
+    at = manifest.params.get(manifest.at_object)
+    if manifest.at_object and (at is None or at.type != "string"):
+        raise _wrong(file, "at_object", f"{manifest.at_object!r} is none of its parameters of type string")
+    robots = manifest.params.get("robots")
+    if manifest.joint and (robots is None or robots.type != "array" or not robots.required):
+        raise _wrong(file, "joint", "needed with it: a required parameter robots of type array")
     for phrase in manifest.phrases:
         if phrase != " ".join(phrase.lower().split()):
             raise _wrong(file, "phrases", f"{phrase!r}: lower case, single spaces")
+
+
+def _with_opposites(skills: dict[str, SkillManifest]) -> dict[str, SkillManifest]:
+    """Return the skills with `opposite_of` symmetric between folders too: a built-in skill cannot name a site's."""
+    found: dict[str, SkillManifest] = {}
+    for name, manifest in skills.items():
+        back = [each.id for each in skills.values() if name in each.opposite_of and each.id not in manifest.opposite_of]
+        opposites = (*manifest.opposite_of, *back)
+        found[name] = msgspec.structs.replace(manifest, opposite_of=opposites) if back else manifest
+    return found
 
 
 def _images(root: Path) -> Iterator[ImageSpec]:

@@ -29,8 +29,6 @@ from appliance.llm.language.words import Words
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
 
-JOINT = frozenset({"rendezvous", "form_up", "lift_together"})
-"""Skills whose robot is the first of their `robots`."""
 ANY = re.compile(r"any[1-9]?|all")
 OPERATOR = "operator"
 MAX_SUBTASKS = 64
@@ -62,7 +60,7 @@ def write(answer: Answer, words: Words, catalogue: Catalogue) -> list[str]:
             symbols.append("|")
         manifest = catalogue.skills[subtask.skill]
         symbols.append(subtask.skill)
-        if subtask.robot is not None and has_robot(subtask.skill, manifest.runs):
+        if subtask.robot is not None and has_robot(manifest.runs, joint=manifest.joint):
             symbols += writer.robot(subtask.robot)
         for name, value in subtask.params.items():
             symbols += [f"{name}:", *writer.value(name, value)]
@@ -71,9 +69,9 @@ def write(answer: Answer, words: Words, catalogue: Catalogue) -> list[str]:
     return symbols
 
 
-def has_robot(skill: str, runs: str) -> bool:
+def has_robot(runs: str, *, joint: bool) -> bool:
     """Whether a subtask of this skill says its robot: not where the skill settles it."""
-    return runs != "compute" and skill not in JOINT
+    return runs != "compute" and not joint
 
 
 class _Writer:
@@ -208,7 +206,7 @@ class _Reader:
         manifest = self._catalogue.skills.get(skill)
         if manifest is None:
             self._fail(f"there is no skill {skill!r}")
-        robot = self._robot() if has_robot(skill, manifest.runs) else None
+        robot = self._robot() if has_robot(manifest.runs, joint=manifest.joint) else None
         params: dict[str, Any] = {}
         while self._peek().endswith(":") and not self._peek().startswith('"'):
             name = self._take()[:-1]
@@ -225,7 +223,7 @@ class _Reader:
                 after.append(f"s{before}")
             if not after or any(int(one[1:]) >= int(two[1:]) for one, two in pairwise(after)):
                 self._fail("numbers of predecessors follow <, each once, in order")
-        if skill in JOINT:
+        if manifest.joint and manifest.runs != "compute":  # its robot is the first of its robots
             robots: list[str] = params.get("robots") or []
             robot = robots[0] if robots else None
         return Subtask(id=f"s{number}", skill=skill, robot=robot, params=params, after=tuple(after))

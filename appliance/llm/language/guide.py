@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from msgspec import Struct
 
 from appliance.llm.language import values
-from appliance.llm.language.codec import JOINT, OPERATOR, has_robot, is_number
+from appliance.llm.language.codec import OPERATOR, has_robot, is_number
 from appliance.llm.language.plurals import singular
 from appliance.llm.language.ranges import between
 from appliance.llm.language.words import Words
@@ -42,6 +42,7 @@ class SkillShape(Struct, frozen=True):
 
     domain: str
     runs: str
+    joint: bool
     params: dict[str, ParamShape]
 
 
@@ -51,6 +52,7 @@ def shapes(catalogue: Catalogue) -> dict[str, SkillShape]:
         name: SkillShape(
             manifest.domain,
             manifest.runs,
+            manifest.joint,
             {each: ParamShape(param.type, param.required) for each, param in manifest.params.items()},
         )
         for name, manifest in catalogue.skills.items()
@@ -163,12 +165,10 @@ class Guide:
     def _begin_subtask(self, skill: str) -> None:
         manifest = self._skills[skill]
         self._skill, self._number = skill, self._number + 1
-        self._left = {
-            name: param.required or (name == "robots" and skill in JOINT) for name, param in manifest.params.items()
-        }
+        self._left = {name: param.required for name, param in manifest.params.items()}
         self._last_before = 0
         self._parameter, self._listed = "", -1
-        if has_robot(skill, manifest.runs):
+        if has_robot(manifest.runs, joint=manifest.joint):
             self._state = "robot"
             self._begin_text()
         else:

@@ -12,7 +12,7 @@ from appliance.llm.rules import names
 from appliance.llm.rules.clauses import Clause, Reader, Who
 from appliance.llm.rules.graph import Graph, Snapshot
 from appliance.llm.rules.phrases import Step
-from appliance.llm.rules.wording import CHECKS, DONE, HERE, LEAD_FIRST, clean, first_chunk
+from appliance.llm.rules.wording import DONE, HERE, LEAD_FIRST, clean, first_chunk
 from appliance.model import RobotInfo, Site
 from appliance.skills.catalogue import Catalogue
 
@@ -92,7 +92,7 @@ class Conditions(ABC):
             if len(graph.steps) > old:
                 graph.barrier |= graph.lasts(range(old, len(graph.steps)))
                 return
-        checked = any(skill in CHECKS for skill, _, _ in graph.steps)
+        checked = any(graph.catalogue.skills[skill].observes for skill, _, _ in graph.steps)
         if word in ("if", "in case"):
             graph.barrier |= graph.lasts()
             if not checked:

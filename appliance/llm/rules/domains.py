@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
 
-_WEAK = frozenset({"goto", "takeoff", "land", "hold", "return_home", "dock", "wait_for", "notify", "report", "compare"})
 _STRONG = ("coordination", "learning", "media")
 """Where one of their skills stands, the others serve it."""
 
@@ -18,9 +17,11 @@ _STRONG = ("coordination", "learning", "media")
 def domain_of(subtasks: Sequence[Subtask], catalogue: Catalogue) -> str:
     """Return the domain of a plan's main purpose."""
     known = [each.skill for each in subtasks if each.skill in catalogue.skills]
-    main = [skill for skill in known if skill not in _WEAK]
-    if "give" in main or "handover" in main:
-        main = [skill for skill in main if skill != "pick"]
+    main = [skill for skill in known if not catalogue.skills[skill].incidental]
+    if any(
+        catalogue.skills[skill].domain != "manipulation" and "load" in catalogue.skills[skill].frees for skill in main
+    ):
+        main = [skill for skill in main if "load" not in catalogue.skills[skill].ties]
     if not main:
         main = [skill for skill in known if skill != "notify"] or known
     domains = Counter(catalogue.skills[skill].domain for skill in main)

@@ -16,9 +16,6 @@ from appliance.llm.rules.phrases import Step
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue
 
-GATHERING = frozenset({"report", "notify", "compare", "merge_maps"})
-"""Computations about all that was done, not about one product."""
-
 
 class Snapshot(Struct):
     """Where things stood before a clause, so that what runs beside it can start from there."""
@@ -100,7 +97,7 @@ class Graph:
             manifest = self.catalogue.skills.get(step.skill)
             compute = manifest is not None and manifest.runs == "compute"
             doers: list[str | None] = [None] if compute else list(robots)
-            if step.skill in ("rendezvous", "form_up", "lift_together"):
+            if manifest is not None and manifest.joint and not compute:
                 doers = [next(iter(step.params["robots"]), None)]
             news: set[int] = set()
             for robot in doers:
@@ -116,7 +113,7 @@ class Graph:
                         after |= frozenset(gateway) if list_item else frozenset()
                     after |= shared
                     nodes = self._robot_steps(step, robot, after)
-                    members = step.params.get("robots", [robot]) if step.skill != "split_area" else [robot]
+                    members = step.params.get("robots", [robot])
                     if len(members) > 1:
                         for other in members:
                             self.before[nodes[0]] |= (
@@ -197,9 +194,11 @@ class Graph:
         nodes: list[int] = []
         held = self.held.setdefault(robot, set())
         thing = step.params.get("object", "")
-        if step.skill == "pick" and thing in held and step.fetch:
+        manifest = self.catalogue.skills.get(step.skill)
+        takes = manifest is not None and "load" in manifest.ties
+        if takes and thing in held and step.fetch:
             return [max(after)] if after else [self._node(step, robot, after)]
-        if step.skill == "place" and step.fetch and thing not in held:
+        if not takes and step.fetch and thing not in held:
             nodes.append(self._node(Step("pick", {"object": thing}), robot, after))
             after = frozenset(nodes[-1:])
         if step.at and self.where.get(robot) != step.at:
@@ -209,11 +208,11 @@ class Graph:
         nodes.append(self._node(step, robot, after))
         if step.skill == "goto":
             self.where[robot] = str(step.params["place"])
-        elif step.skill in ("return_home", "patrol", "explore", "follow", "follow_path", "guide", "dock", "rendezvous"):
+        elif manifest is not None and "position" in manifest.prepares:
             self.where[robot] = str(step.params.get("place") or step.params.get("station") or "")
-        if step.skill == "pick":
+        if takes:
             held.add(thing)
-        elif step.skill in ("place", "give", "handover"):
+        elif manifest is not None and "load" in manifest.frees:
             held.discard(thing)
             if step.skill == "handover":
                 self.held.setdefault(str(step.params.get("to", "")), set()).add(thing)
@@ -224,13 +223,18 @@ class Graph:
         after = set(start.barrier)
         if ends:
             return after | ends
-        if step.skill in GATHERING:
+        if self._gathers(step.skill):
             return after | (self.lasts(self.scope) if self.scope and list_item else self.lasts())
         if list_item:
             after |= start.thread
         if not step.params.get("source"):
             after |= self._producers(step.skill)
         return after
+
+    def _gathers(self, skill: str) -> bool:
+        """Whether a computation is about all that was done, not about one product."""
+        manifest = self.catalogue.skills.get(skill)
+        return manifest is not None and (manifest.reports or len(manifest.feeds_on) > 1)
 
     def _producers(self, skill: str) -> set[int]:
         """Return the subtasks of the latest clause that makes what a computation consumes."""

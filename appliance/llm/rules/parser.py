@@ -401,12 +401,13 @@ class Parser(Conditions):
     def _remember(self, clause: Clause) -> None:
         mentions = self._reader.mentions
         for step in clause.steps:
+            manifest = self._graph.catalogue.skills[step.skill]
             for key in ("object", "target", "asset", "source"):
                 if value := step.params.get(key):
                     mentions.thing = str(value)
-            if step.skill == "pick" or step.fetch:
+            if "load" in manifest.ties or step.fetch:
                 mentions.held = str(step.params.get("object", ""))
-            if step.skill in ("place", "give", "handover"):
+            if "load" in manifest.frees:
                 mentions.held = ""
             for key in ("place", "area", "station"):
                 if value := step.params.get(key):

@@ -55,22 +55,6 @@ DONE = re.compile(
     re.IGNORECASE,
 )
 HERE = re.compile(r"(?:there|done|finished|ready|complete|arrived|in position|back|airborne)", re.IGNORECASE)
-CHECKS = frozenset(
-    {
-        "inspect",
-        "find",
-        "detect",
-        "count",
-        "ask",
-        "read",
-        "measure",
-        "scan_thermal",
-        "compare",
-        "track",
-        "wait_for",
-        "photograph",
-    }
-)
 FILE = re.compile(
     r"(?:(?:take|use|with|for|from) )?(?P<file>[\w-]+\.[A-Za-z][A-Za-z0-9]{1,4})\s*[:,]\s*(?P<rest>.+)",
     re.IGNORECASE | re.DOTALL,
