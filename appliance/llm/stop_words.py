@@ -38,7 +38,15 @@ def stop_request(text: str, robots: Sequence[str] = ()) -> StopRequest | None:
         return None
     roster = _roster(tuple(robots))
     budget = _Budget()
-    found = [heard for each in sentences if (heard := _sentence(each, roster, budget)) is not None]
+    found: list[_Heard] = []
+    follows = False
+    for each in sentences:
+        if (heard := _sentence(each, roster, budget)) is None and follows:
+            # "stop rover_1; rover_2"
+            heard = _clause(each.tokens, roster, budget, first=False, names=True)
+        if heard is not None:
+            found.append(heard)
+        follows = heard is not None and not heard.fleet
     if not found:
         return None
     if any(each.fleet for each in found):
@@ -180,7 +188,7 @@ _WORDS: dict[_Kind, str] = {
         parem|parar tudo|pare ja|detenha-se|detenha se|detenham se|parada de emergencia|nao se mexa|nao se mexam|
         arrete|arretez|arreter|arrete toi|arretez vous|arretons|arret|arret d'urgence|stoppe|stoppez|halte|halte la|
         ne bouge pas|ne bougez pas|ne bouge plus|ne bougez plus|
-        stopp|stoppen|stoppt|stoppen sie|anhalten|halt an|haltet an|halten sie an|stehen bleiben|stehenbleiben|
+        stopp|stoppen|stoppt|stoppen sie|anhalten|halt an|halte an|haltet an|halten sie an|stehen bleiben|stehenbleiben|
         bleib stehen|bleibt stehen|bleiben sie stehen|nothalt|not halt|notaus|not aus|notstopp|not stopp|
         nicht bewegen|keine bewegung|
         fermati|ferma|fermo|ferma ti|fermi|ferme|fermate|fermatevi|fermare|fermarsi|alt|arresto|arresto di emergenza|
@@ -250,6 +258,20 @@ _CONDITIONS = frozenset(
     )
 )
 """A clause that begins so goes with the stop before it: "stop, when you are at dock 1"."""
+_CONDITIONAL = frozenset(
+    ("if", "when", "whenever", "once", "unless", "until", "till", "after", "before", "while", "wenn", "falls", "sobald")
+) | frozenset(("si", "cuando", "quand", "quando", "se", "als", "wanneer", "gdy", "jesli", "jezeli", "kiedy"))
+"""Words of a sentence whose last clause is no stop of now: "if you see a person, stop!"."""
+_GENERIC = frozenset(
+    re.findall(
+        r"\w+",
+        "robot robots vehicle vehicles machine machines unit units bot bots roboter fahrzeug fahrzeuge vehiculo "
+        "vehiculos veiculo veiculos robo robos vehicule vehicules voertuig voertuigen robota roboty "
+        "robotow pojazd pojazdy",
+    )
+)
+"""Nouns that stand beside a name as well: "robot rover_1"."""
+_NUMBER = frozenset(("number", "nr", "nummer", "numero", "num"))
 _KINDS = {
     **{each: each for each in ("drone", "rover", "uav", "ugv", "quadcopter", "copter", "robot", "unit", "vehicle")},
     **dict.fromkeys(("drones", "drohne", "drohnen", "dron", "drony", "drona", "droni", "dronow"), "drone"),
@@ -389,13 +411,14 @@ def _of_kind(
     """Take the number behind "rover" or "rovers", or all robots of that kind when there is none."""
     kind = _KINDS.get(said[-1], said[-1])
     prefix = (*said[:-1], kind if (*said[:-1], kind) in roster.kinds else kind.removesuffix("s"))
-    if not (number := _number(tokens, at)):
+    skip = int(at < len(tokens) and tokens[at] in _NUMBER)
+    if not (number := _number(tokens, at + skip)):
         heard.robots += found
         if not found:
             heard.unknown.append(" ".join(said))
         return 0
     _numbered(prefix, number, roster, heard)
-    return 1 + _more(tokens, at + 1, prefix, roster, heard)
+    return skip + 1 + _more(tokens, at + skip + 1, prefix, roster, heard)
 
 
 def _more(tokens: Sequence[str], at: int, prefix: tuple[str, ...], roster: _Roster, heard: _Heard) -> int:
@@ -471,15 +494,24 @@ def _sentence(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | Non
             break
         if behind and (heard := _clause(tokens[:comma], roster, budget, first=said.first)) is not None:
             return heard
-    if commas and "!" in said.mark:
+    if commas and "!" in said.mark and _CONDITIONAL.isdisjoint(tokens):
         return _clause(tokens[commas[-1] + 1 :], roster, budget, first=False)
     return None
 
 
 def _clause(
-    tokens: Sequence[str], roster: _Roster, budget: _Budget, *, first: bool, question: bool = False
+    tokens: Sequence[str],
+    roster: _Roster,
+    budget: _Budget,
+    *,
+    first: bool,
+    question: bool = False,
+    names: bool = False,
 ) -> _Heard | None:
-    """Return the stop that a clause is; None when a word of it is neither stop word, robot nor courtesy."""
+    """Return the stop that a clause is; None when a word of it is neither stop word, robot nor courtesy.
+
+    With `names` it needs no stop word, but robots: the clause before it is the stop.
+    """
     if question and tokens[0] in _ASKING:
         return None
     clause = _Clause(first=first, question=question)
@@ -489,20 +521,21 @@ def _clause(
         if tokens[at] == ",":
             pass
         elif (named := _named(tokens, at, roster, clause.into)) > 0:
-            clause.article, taken = False, named
+            clause.names()
+            taken = named
         elif kind is not None:
             if not clause.takes(kind, tokens, at):
                 return None
         elif tokens[at] in _AND:
             # "Go to dock 1. And stop." is a step of a task.
-            if clause.empty and not first:
+            if clause.empty and not first and not names:
                 return None
         elif (taken := _mistyped(tokens, at, roster, clause.into, budget)) > 0:
-            clause.article = False
+            clause.names()
         else:
             return None
         at += taken
-    return clause.result(roster)
+    return clause.result(roster, names=names)
 
 
 class _Clause:
@@ -516,12 +549,16 @@ class _Clause:
         self._spared = _Heard()
         self._first = first
         self._question = question
-        self._stops = False
+        self._stops = self._each = False
 
     @property
     def empty(self) -> bool:
         """Whether neither a stop word nor a robot was said."""
         return not (self._stops or self._heard.robots or self._heard.unknown)
+
+    def names(self) -> None:
+        """Note that robots were named: what led to them is done with."""
+        self.article = self._each = False
 
     def takes(self, kind: _Kind, tokens: Sequence[str], at: int) -> bool:
         """Take a known phrase; False when the clause is no stop for it."""
@@ -530,10 +567,10 @@ class _Clause:
                 self._stops = True
                 return not self.article
             case _Kind.ALL:
-                self.into.everything = True
-                self.article = False
+                self.into.everything = self.into.everything or self._each or tokens[at] not in _GENERIC
+                self.article = self._each = False
             case _Kind.EACH:
-                self.article = False
+                self.article, self._each = False, True
             case _Kind.ARTICLE:
                 self.article = True
             case _Kind.NO:
@@ -549,8 +586,8 @@ class _Clause:
                 pass
         return True
 
-    def result(self, roster: _Roster) -> _Heard | None:
-        if not self._stops or self.article:
+    def result(self, roster: _Roster, *, names: bool) -> _Heard | None:
+        if self.article or not (self._stops or (names and (self._heard.everything or not self.empty))):
             return None
         spared = self._spared
         if spared.robots or spared.unknown or spared.everything:

@@ -76,6 +76,8 @@ stop the robots
 stop the robot
 stop the fleet
 stop all of them
+stop rover_1 and all robots
+stop rover_1; everything!
 stop it
 stop moving
 all of you must stop
@@ -188,6 +190,12 @@ NAMED = {
     "Rover_1: go to dock 1; drone_1: stop": ("drone_1",),
     "Rover_1 stop. Drone_1 stop.": ("rover_1", "drone_1"),
     "rover_1, stop, you hit the wall": ("rover_1",),
+    "stop robot rover_1": ("rover_1",),
+    "stop the robots rover_1 and drone_1": ("rover_1", "drone_1"),
+    "stop rover number 1": ("rover_1",),
+    "stop rover_1; rover_2!": ROVERS,
+    "stop rover_1. Drone_1, land": ("rover_1",),
+    "rover_1 halte an": ("rover_1",),
 }
 
 UNKNOWN = {
@@ -224,6 +232,8 @@ read the stop sign
 stop when you see a person
 stop, when you see a person
 stop if the battery is low
+if you see a person, stop!
+rover_1: if you see a person, stop!
 stop after 5 s
 stop for 5 s
 stop in 10 seconds
