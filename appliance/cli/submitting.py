@@ -183,7 +183,8 @@ def on_terminal() -> bool:
 
 def _answer(question: str) -> Literal["yes", "no", "edit"]:
     try:
-        said = console.out.input(f"{question} [y]es, [N]o, [e]dit: ").strip().casefold()
+        prompt = f"{question} [y]es, [N]o, [e]dit: "
+        said = console.out.input(prompt, markup=False, emoji=False).strip().casefold()
     except (EOFError, KeyboardInterrupt):
         console.out.print()
         return "no"

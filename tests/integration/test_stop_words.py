@@ -1,6 +1,7 @@
 """A stop typed as an instruction, and plans that wait for approval, by the command line on a fleet of processes."""
 
 import asyncio
+import contextlib
 import os
 import pty
 import sys
@@ -166,28 +167,30 @@ async def asked_on_a_terminal(fleet: FleetState, client: FleetClient) -> None:
 
 async def at_terminal(fleet: FleetState, key: bytes, *words: str) -> tuple[int, str]:
     """Run a command at a terminal, and press a key when it asks."""
-    child, terminal = pty.fork()
-    if child == 0:
-        os.environ["SWIFTBOT_OPERATOR"] = "ann"
-        place = ("--dir", fleet.directory, "--fleet", fleet.fleet)
-        os.execv(sys.executable, [sys.executable, "-m", "appliance.cli", *words, *place])  # noqa: S606 - no shell
-
-    def talk() -> tuple[int, str]:
-        said, pressed = b"", False
-        while True:
-            try:
-                said += (more := os.read(terminal, 4096))
-            except OSError:
-                break
-            if not more:
-                break
-            if key and b"Run this plan?" in said and not pressed:
-                pressed = True
-                os.write(terminal, key)
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), said.decode()
-
+    ours, its = pty.openpty()
+    os.set_blocking(ours, False)
+    place = ("--dir", fleet.directory, "--fleet", fleet.fleet)
+    process = await asyncio.create_subprocess_exec(
+        "setsid", "--ctty", "--wait", sys.executable, "-m", "appliance.cli", *words, *place,
+        stdin=its, stdout=its, stderr=its, env=dict(os.environ) | {"SWIFTBOT_OPERATOR": "ann", "TERM": "xterm"},
+    )  # fmt: skip
+    os.close(its)
+    said, pressed = b"", not key
+    ended = asyncio.create_task(process.wait())
     try:
-        async with asyncio.timeout(60):
-            return await asyncio.to_thread(talk)
+        for _ in range(1200):
+            # Looked at before the last read: what it printed until its end is read.
+            over = ended.done()
+            with contextlib.suppress(OSError):
+                said += os.read(ours, 65536)
+            if over:
+                return process.returncode or 0, said.decode()
+            if not pressed and b"[e]dit: " in said:
+                pressed = True
+                os.write(ours, key)
+            await asyncio.sleep(0.05)
     finally:
-        os.close(terminal)
+        os.close(ours)
+    process.kill()
+    await ended
+    raise AssertionError(f"it does not end: {said.decode()}")

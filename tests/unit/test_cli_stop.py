@@ -298,7 +298,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the answers that a person at the terminal will give."""
     answers: list[str] = []
     monkeypatch.setattr(submitting, "on_terminal", lambda: True)
-    monkeypatch.setattr(submitting.console.out, "input", lambda _: answers.pop(0))
+    monkeypatch.setattr(submitting.console.out, "input", lambda _, **__: answers.pop(0))
     return answers
 
 
