@@ -164,7 +164,7 @@ def _value(said: Any, want: Any, site: Site) -> bool:
 
 
 def _bare(text: str) -> set[str]:
-    return {word.rstrip("s") for word in _SMALL.sub(" ", figures(text)).replace(",", " ").split()}
+    return {word.rstrip("s.") for word in _SMALL.sub(" ", figures(text)).replace(",", " ").split()}
 
 
 def _before(subtasks: Sequence[Mapping[str, Any]]) -> set[tuple[str, str]]:

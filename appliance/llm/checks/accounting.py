@@ -110,6 +110,8 @@ def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | Non
             if said and name not in FREE and not isinstance(value, int | float):
                 # A name that swallows "unless" or "then" has not accounted for it.
                 said = {index for index in said if reading.tokens[index].text not in lx.GUARDS}
+                if any(_counts(reading, index) for index in said):
+                    said = None  # "the aisle three times" is no aisle 3
             if said:
                 found.values[subtask.id] |= said
                 found.covered |= said
@@ -128,6 +130,15 @@ def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | Non
     for subtask in plan.subtasks:
         _param_words(reading, subtask, found)
     return found
+
+
+def _counts(reading: Reading, index: int) -> bool:
+    """Whether a number says how often or how much: "three times", "2 laps", "5 m"."""
+    tokens = reading.tokens
+    after = tokens[index + 1].text if index + 1 < len(tokens) else ""
+    return tokens[index].value is not None and (
+        after in ("times", "laps", "rounds") or after in lx.UNITS - {"m", "s", "h", "min"}
+    )
 
 
 # --- values --------------------------------------------------------------------------------------------------------
@@ -178,8 +189,10 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
         if _starts_quantity(tokens[at]) and (tokens[at].value or 0) >= 0:
             for length in range(1, 8):
                 window = tokens[at : at + length]
-                if len(window) < length or any(
-                    each.kind in ("quote", "robot") or each.text in _ENDS for each in window
+                if (
+                    not all(_of_quantity(each) for each in window)
+                    or len(window) < length
+                    or any(each.kind in ("quote", "robot") or each.text in _ENDS for each in window)
                 ):
                     break
                 if not (_ends_quantity(window[-1]) if unit else _ends_number(window[-1])):
@@ -195,6 +208,16 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
 
 
 _ENDS = frozenset((";", "?", "!", "\n", ","))
+
+
+def _of_quantity(token: Token) -> bool:
+    """Whether a token may be part of a quantity: "a million" is no 1."""
+    return (
+        _starts_quantity(token)
+        or token.text in lx.UNITS
+        or token.text
+        in ("times", "time", "quarters", "dozen", "hundred", "thousand", "and", "of", "per", "-", "/", "more")
+    )
 
 
 def _ends_number(token: Token) -> bool:

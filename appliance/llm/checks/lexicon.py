@@ -50,7 +50,7 @@ NEGATIONS = _set(
 )
 """Words that forbid what follows."""
 EXCEPTIONS = _set(
-    "unless except excepting excluding exclude other-than save bar barring apart instead rather but-not only"
+    "than unless except excepting excluding exclude other-than save bar barring apart instead rather but-not only"
 )
 """Words that take something out of an order."""
 CONDITIONS = _set(
@@ -107,8 +107,8 @@ DELIVERY = _set(
 SUBORDINATE = _set("reaches arrives lands returns comes goes finishes stands")
 """Verbs of robots that say when something is to happen."""
 IN_NO_NAME = _set(
-    "quarter half double turn degrees percent for at to while then until times laps infinity once twice every before "
-    "after when where which"
+    "till midnight noon tomorrow tonight daily hourly than unless without quarter half double turn degrees percent "
+    "for at to while then until times laps infinity once twice every before after when where which"
 )
 """Words that stand in no name of a thing or place."""
 FIXTURES = _set(

@@ -49,7 +49,28 @@ _MEASURE = re.compile(
 """A quantity with its unit."""
 
 
-_NO_EVENT = lx.UNITS | frozenset(NUMBERS) | {"at", "for", "in", "about", "a", "an", "half", "after", "the", "of", "and"}
+_NO_EVENT = (
+    lx.UNITS
+    | frozenset(NUMBERS)
+    | {
+        "at",
+        "for",
+        "in",
+        "about",
+        "a",
+        "an",
+        "half",
+        "after",
+        "the",
+        "of",
+        "and",
+        "radius",
+        "height",
+        "speed",
+        "altitude",
+        "high",
+    }
+)
 """A quantity alone is nothing that happens."""
 
 
@@ -410,7 +431,14 @@ def question(facts: Facts) -> Iterable[Finding]:
         ):
             continue
         subtasks = _of(facts, set(inside))
-        if words and words[0] in ("what", "how") and subtasks and all(_perceives(facts, each) for each in subtasks):
+        past = set(words) & {"did", "was", "were", "had", "has", "have"}
+        if (
+            words
+            and words[0] in ("what", "how")
+            and not past
+            and subtasks
+            and all(_perceives(facts, each) for each in subtasks)
+        ):
             continue
         yield _hold("question", "it reads as a question, not as an order", (facts.words(inside),),
                     hint="ask for the state of robots with: swiftbot robots")  # fmt: skip
