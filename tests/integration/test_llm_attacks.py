@@ -174,9 +174,9 @@ async def slot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
         tiers=("local",),
         local_model=model,
         local_max_tokens=32_768,
-        local_min_confidence=0.0,
+        run_confidence=0.0,
         local_deadline_s=120.0,
-        floor_confidence=0.0,
+        show_confidence=0.0,
         require_implemented=False,
         repair=False,
     )
@@ -203,13 +203,13 @@ async def test_rules(attack: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("attack", ATTACKS, ids=lambda each: each["id"])
 async def test_an_upstream_model_that_obeys_the_attacker(attack: dict[str, Any]) -> None:
-    """Whatever is added outside roster and policy, or said nowhere in the instruction, refuses the whole plan."""
+    """Whatever is added outside roster and policy, or said nowhere in the instruction: the whole plan does not run."""
     tier = ObedientTier()
     tier.attack = attack
-    slots = [Slot(planner=tier, deadline_s=5, min_confidence=0.5, leaves_machine=True)]
+    slots = [Slot(planner=tier, deadline_s=5, leaves_machine=True)]
     config = LlmConfig(require_implemented=False)
     plan = await put(Decomposer(config, CATALOGUE, safety=POLICY, slots=slots), attack)
-    assert plan is None
+    assert plan is None or (plan.provenance is not None and plan.provenance.confirm)
 
 
 @pytest.mark.parametrize("kind", ["instruction", "place", "reason"])
@@ -217,7 +217,7 @@ async def test_without_an_attack_the_same_model_is_taken(kind: str) -> None:
     """The plan that the attacks are added to is a good one: it is their additions that are refused."""
     tier = ObedientTier()
     tier.attack = {"kind": kind}
-    slots = [Slot(planner=tier, deadline_s=5, min_confidence=0.5, leaves_machine=True)]
+    slots = [Slot(planner=tier, deadline_s=5, leaves_machine=True)]
     asked = "Rover_1: pick the box" if kind == "instruction" else "Rover_1: go to dock 1, then photograph the shelf"
     plain = {"kind": kind, "text": "bay 7", "instruction": asked}
     plan = await put(Decomposer(LlmConfig(require_implemented=False), CATALOGUE, safety=POLICY, slots=slots), plain)

@@ -159,7 +159,7 @@ async def start(tmp_path: Path, free_ports: Callable[..., list[int]]) -> AsyncIt
         for number, config in enumerate(configs):
             plane_config = PlaneConfig(listen=(endpoints[number],), connect=tuple(endpoints[:number]))
             plane = await Plane.open(plane_config, fleet="f", gateway=f"g{number}", data_dir=tmp_path / f"g{number}")
-            gate = Gate(plane, config, safety or SafetyConfig(confirm_below=0.0))
+            gate = Gate(plane, config, safety or SafetyConfig(choose_robot="auto"))
             gates.append(gate)
             await gate.start()
         client_config = PlaneConfig(mode="client", connect=(endpoints[0],), connect_timeout_s=5)
@@ -241,7 +241,7 @@ async def test_bad_input_through_the_gateways_verbs(start: Callable[..., Any], t
 
 def sure_of_nothing(**more: Any) -> dict[str, Any]:
     """Return settings that take any model's plan."""
-    return {"local_min_confidence": 0.0, "floor_confidence": 0.0, "require_implemented": False, **more}
+    return {"run_confidence": 0.0, "show_confidence": 0.0, "require_implemented": False, **more}
 
 
 async def test_a_gateway_without_a_model_asks_one_that_has(start: Callable[..., Any], model: Path) -> None:
@@ -375,9 +375,9 @@ async def test_a_plan_that_succeeded_comes_from_the_cache_and_leaves_it_when_it_
 
 
 async def test_a_plan_that_nobody_is_sure_of_waits_for_the_operator(start: Callable[..., Any]) -> None:
-    """Below the confirmation threshold a task waits as proposed, with the reason; nothing has run."""
-    config = LlmConfig(tiers=("rules",), require_implemented=False, rules_min_confidence=0.0)
-    fleet = await start(config, safety=SafetyConfig(confirm_below=0.9))
+    """With words that its plan does not account for a task waits as proposed, with the words; nothing has run."""
+    config = LlmConfig(tiers=("rules",), require_implemented=False, show_confidence=0.0)
+    fleet = await start(config)
     (gate,) = fleet.gates
     request = TaskRequest(instruction="Rover_1: go to dock 1. Abracadabra simsalabim hocus pocus.", id="t-1")
     await fleet.client.rpc.call("g0", "submit", request, TaskRecord, timeout_s=10.0)
@@ -389,5 +389,5 @@ async def test_a_plan_that_nobody_is_sure_of_waits_for_the_operator(start: Calla
         assert time.monotonic() < give_up, record
         await asyncio.sleep(0.05)
     assert record.proposal is not None
-    assert "below confirm threshold 0.90" in record.proposal.note
+    assert "abracadabra" in record.proposal.note
     assert gate.runs.done == []

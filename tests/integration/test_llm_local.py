@@ -251,9 +251,7 @@ async def test_slot_ends_when_its_gateway_is_gone(model: Path) -> None:
 async def test_cascade_falls_back_from_a_model_that_guesses(model: Path) -> None:
     """A model that is not sure is passed over for the rules, and so is a folder that is not there."""
     for folder in (str(model), "/nonexistent/model"):
-        cascade = Decomposer(
-            LlmConfig(local_model=folder, local_max_tokens=TOKENS, local_min_confidence=1.0), CATALOGUE
-        )
+        cascade = Decomposer(LlmConfig(local_model=folder, local_max_tokens=TOKENS, run_confidence=0.6), CATALOGUE)
         await cascade.start()
         try:
             outcome = await cascade.plan(PlanContext(instruction="Rover_1: go to dock 1"))

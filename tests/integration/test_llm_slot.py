@@ -230,7 +230,7 @@ async def test_a_gateway_without_a_model_can_be_given_one(tiny: Callable[..., Pa
     given = config(Path("/unset"), tiers=("local", "rules"))
     from msgspec.structs import replace  # noqa: PLC0415
 
-    decomposer = Decomposer(replace(given, local_model="", local_min_confidence=0.0), CATALOGUE)
+    decomposer = Decomposer(replace(given, local_model="", run_confidence=0.0), CATALOGUE)
     await decomposer.start()
     try:
         assert decomposer.tiers == ("rules",)
