@@ -80,8 +80,8 @@ def run(ctx):
 SKILLS = {
     "lingers": (LINGERS, "silent_s = 2"),
     "hushed": (HUSHED, "silent_s = 2"),
-    "works": (WORKS, ""),
-    "breaks": (BREAKS, ""),
+    "works": (WORKS, 'phrases = ["do"]'),
+    "breaks": (BREAKS, 'phrases = ["go on"]'),
     "breaks_gently": (BREAKS, '[[alternatives]]\nskill = "works"\nparams = { note = "$note" }'),
 }
 
@@ -115,7 +115,7 @@ FIRST = {
 }
 AGAIN = {
     "domain": "coordination",
-    "subtasks": [subtask("a", "works", "begin", []), subtask("b", "works", "otherwise", ["a"])],
+    "subtasks": [subtask("a", "works", "begin", []), subtask("b", "works", "on", ["a"])],
 }
 
 
@@ -271,7 +271,7 @@ async def test_work_that_goes_wrong_is_found_and_mended(up: Up, upstream: Upstre
         assert record.subtasks[0].result is not None
         assert record.subtasks[0].result["note"] == "kept"
 
-        accepted = await client.submit(TaskRequest(instruction="begin, then on with it, otherwise as you can"))
+        accepted = await client.submit(TaskRequest(instruction="do begin, then go on"))
         begun = await follow(
             client,
             accepted.id,
@@ -280,7 +280,8 @@ async def test_work_that_goes_wrong_is_found_and_mended(up: Up, upstream: Upstre
         record = await end(client, accepted.id)
         assert record.state is TaskState.SUCCEEDED, record.failure
         assert record.of("s1") == replace(begun.of("s1")), "what was finished has changed"
-        assert [each.subtask.params["note"] for each in record.subtasks] == ["begin", "otherwise"]
+        assert [each.subtask.params["note"] for each in record.subtasks] == ["begin", "on"]
+        assert [each.subtask.skill for each in record.subtasks] == ["works", "works"]
         assert [each.kind for each in record.revisions] == [RevisionKind.PLAN]
         assert record.subtasks[1].subtask.after == ("s1",)
         assert "broken on purpose" in upstream.asked[-1]
