@@ -150,7 +150,7 @@ def _consistency(facts: Facts) -> Iterable[Finding]:
 
 CHECKS: tuple[Check, ...] = (
     Check("schema", _refusing("schema", _schema)),
-    Check("contradiction", _refusing("contradiction", lambda facts: contradictions(facts.plan))),
+    Check("contradiction", _refusing("contradiction", lambda facts: contradictions(facts.plan, facts.catalogue))),
     Check("policy", _refusing("policy", _policy)),
     Check("grounding", _refusing("grounding", _grounding), words=True),
     Check("negation", wording.negation, words=True),

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 
-from appliance.llm.checks.schema import JOINT
 from appliance.llm.language.plurals import singular
 from appliance.model import Subtask
 from appliance.skills.catalogue import Catalogue, SkillManifest
@@ -37,15 +36,6 @@ _TOGETHER = re.compile(
 _PLACE = re.compile(r"(.*\D) (\d+|[a-z])")
 """A place of a kind of which there are several."""
 _HELD = re.compile(r"\b(hold|holding|held|holds|carrying|carries|you have|you've got|has got|in (its|your) gripper)\b")
-_FEEDS = {
-    "encode_clip": ("extract_frames",),
-    "classify_action": ("encode_clip",),
-    "correct_text": ("transcribe",),
-    "aggregate": ("train_local",),
-    "merge_maps": ("map_area", "explore", "detect", "find"),
-    "compare": ("photograph", "inspect", "scan_thermal", "measure", "count", "read", "map_area", "explore"),
-}
-"""Consumers that come after a producer whenever the plan has one."""
 _ANY = re.compile(r"any\d*|all")
 
 
@@ -147,7 +137,7 @@ def _robot(subtask: Subtask, manifest: SkillManifest, meaning: Meaning, words: f
     listed: list[str] = subtask.params.get("robots") or []
     if (subtask.robot is None) != (manifest.runs == "compute"):
         yield "a skill that runs as compute has robot -, any other has a robot"
-    if subtask.skill in JOINT and subtask.robot is not None and listed[:1] != [subtask.robot]:
+    if manifest.joint and subtask.robot is not None and listed[:1] != [subtask.robot]:
         yield "a joint skill's robot is the first of its robots"
     if len(set(listed)) != len(listed):
         yield "a robot is listed twice"
@@ -186,7 +176,7 @@ def _order(meaning: Meaning, catalogue: Catalogue) -> Iterable[str]:
         for other in subtask.after:
             if any(other in reach[third] for third in subtask.after):
                 yield f"{subtask.id}: < {other} follows from its other predecessors"
-        yield from _feeds(subtask, meaning, reach)
+        yield from _feeds(subtask, meaning, reach, catalogue)
     together = bool(_TOGETHER.search(meaning.instruction.lower()))
     for index, one in enumerate(meaning.subtasks):
         for two in meaning.subtasks[index + 1 :]:
@@ -197,17 +187,18 @@ def _order(meaning: Meaning, catalogue: Catalogue) -> Iterable[str]:
                 yield f"{one.id} and {two.id} use the {' and '.join(sorted(shared))} of one robot at once"
             elif not together:
                 yield f"{one.id} and {two.id} run together on one robot, which the instruction does not say"
-    yield from _moves(meaning)
+    yield from _moves(meaning, catalogue)
 
 
-def _feeds(subtask: Subtask, meaning: Meaning, reach: dict[str, frozenset[str]]) -> Iterable[str]:
-    producers = {each.id for each in meaning.subtasks if each.skill in _FEEDS.get(subtask.skill, ())}
+def _feeds(subtask: Subtask, meaning: Meaning, reach: dict[str, frozenset[str]], catalogue: Catalogue) -> Iterable[str]:
+    feeds = catalogue.skills[subtask.skill].feeds_on
+    producers = {each.id for each in meaning.subtasks if each.skill in feeds}
     aside = {each for each in producers if subtask.id not in reach[each]}
     if aside and not producers & reach[subtask.id]:
         yield f"{subtask.id} ({subtask.skill}): it must come after what it uses, one of {', '.join(sorted(aside))}"
 
 
-def _moves(meaning: Meaning) -> Iterable[str]:
+def _moves(meaning: Meaning, catalogue: Catalogue) -> Iterable[str]:
     """A way to where the robot already is, up or down too; a thing put down that was never picked up, or too far away.
 
     A robot that was sent to dock 3 puts nothing down at dock 2: what is at hand is not of the kind of place it is at.
@@ -231,7 +222,7 @@ def _moves(meaning: Meaning) -> Iterable[str]:
             if where.get(robot) == there:
                 yield f"{subtask.id}: {robot} is there already"
             where[robot] = there
-        elif _travels(subtask.skill):
+        elif catalogue.skills[subtask.skill].moves_robot:
             where.pop(robot, None)
         elif subtask.skill == "pick":
             held.add((robot, subtask.params.get("object")))
@@ -243,13 +234,6 @@ def _moves(meaning: Meaning) -> Iterable[str]:
             at, last = (_PLACE.fullmatch(str(each)) for each in (subtask.params.get("at"), where.get(robot)))
             if at and last and at[1] == last[1] and at[2] != last[2]:
                 yield f"{subtask.id}: {robot} was sent to {last[0]}, and {at[0]} is another"
-
-
-def _travels(skill: str) -> bool:
-    """Whether a skill other than goto takes a robot elsewhere."""
-    return skill in {
-        "follow_path", "patrol", "explore", "map_area", "follow", "guide", "rendezvous", "lift_together", "orbit",
-    }  # fmt: skip
 
 
 def _crew(subtask: Subtask) -> set[str]:

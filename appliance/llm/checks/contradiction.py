@@ -8,20 +8,16 @@ from collections.abc import Iterable
 from itertools import combinations
 
 from appliance.model import Plan, Subtask
-
-_OPPOSITES = (("open", "close"), ("switch_on", "switch_off"), ("fasten", "unfasten"), ("takeoff", "land"))
-_MOVES = frozenset({"goto", "follow_path", "patrol", "explore", "map_area", "orbit", "return_home", "dock", "follow",
-                    "guide", "hold", "takeoff", "land"})  # fmt: skip
-"""Skills that take a robot's whole body somewhere, or keep it there."""
+from appliance.skills.catalogue import Catalogue
 
 
-def contradictions(plan: Plan) -> Iterable[str]:
+def contradictions(plan: Plan, catalogue: Catalogue) -> Iterable[str]:
     """Return the pairs that contradict each other, each with a remedy."""
     before = precedes(plan)
     for one, other in combinations(plan.subtasks, 2):
         if one.id in before[other.id] or other.id in before[one.id]:
             continue
-        if _opposite(one, other) and _same_thing(one, other, plan, before):
+        if _opposite(one, other, catalogue) and _same_thing(one, other, plan, before, catalogue):
             thing = one.params.get("object") or one.robot
             yield (
                 f"{one.id} and {other.id}: {one.skill} and {other.skill} of {str(thing)[:60]} at the same time "
@@ -30,7 +26,8 @@ def contradictions(plan: Plan) -> Iterable[str]:
         elif (
             one.robot
             and one.robot == other.robot != "all"
-            and {one.skill, other.skill} <= _MOVES
+            and _holds_base(one, catalogue)
+            and _holds_base(other, catalogue)
             and _differ(one, other)
         ):
             yield (
@@ -55,16 +52,22 @@ def precedes(plan: Plan) -> dict[str, set[str]]:
     return found
 
 
-def _opposite(one: Subtask, other: Subtask) -> bool:
-    pair = {one.skill, other.skill}
-    if not any(pair == set(each) for each in _OPPOSITES):
-        return False
-    if one.skill in ("takeoff", "land"):
+def _holds_base(subtask: Subtask, catalogue: Catalogue) -> bool:
+    """Whether a subtask takes a robot's whole body somewhere, or keeps it there."""
+    manifest = catalogue.skills.get(subtask.skill)
+    return manifest is not None and "base" in manifest.uses and not manifest.joint
+
+
+def _opposite(one: Subtask, other: Subtask, catalogue: Catalogue) -> bool:
+    manifest = catalogue.skills.get(one.skill)
+    if manifest is None or other.skill not in manifest.opposite_of or "load" in (*manifest.ties, *manifest.frees):
+        return False  # what one robot puts down another may take
+    if manifest.flying:
         return one.robot == other.robot
     return one.params.get("object") == other.params.get("object")
 
 
-def _same_thing(one: Subtask, other: Subtask, plan: Plan, before: dict[str, set[str]]) -> bool:
+def _same_thing(one: Subtask, other: Subtask, plan: Plan, before: dict[str, set[str]], catalogue: Catalogue) -> bool:
     """Whether two robots mean one thing by a name: not at different places, and not where each does both in order."""
     if one.robot == other.robot:
         return True
@@ -74,7 +77,7 @@ def _same_thing(one: Subtask, other: Subtask, plan: Plan, before: dict[str, set[
     own = [
         (first, then)
         for first, then in combinations(plan.subtasks, 2)
-        if first.robot == then.robot and _opposite(first, then) and first.params.get("object") == thing
+        if first.robot == then.robot and _opposite(first, then, catalogue) and first.params.get("object") == thing
     ]
     return not any(first.id in before[then.id] or then.id in before[first.id] for first, then in own)
 

@@ -20,9 +20,6 @@ from appliance.skills.catalogue import Catalogue
 
 PLACES = ("place", "area", "station", "path", "at", "to", "into", "asset", "target", "object")
 """Parameters that may name where a robot goes, or what it goes to."""
-_LEAVES = frozenset({"goto", "follow_path", "patrol", "explore", "map_area", "orbit", "return_home", "dock", "follow",
-                     "guide", "rendezvous", "form_up", "lift_together"})  # fmt: skip
-"""Skills after which a robot is no longer where it was."""
 _LOWERED = frozenset({"altitude_m", "speed_mps"})
 """What a skill chooses of these is lowered to the limit when it is sent."""
 _LIMITS = (("altitude_m", "m", "altitude"), ("speed_mps", "m/s", "speed"), ("duration_s", "s", "duration"))
@@ -141,14 +138,14 @@ def _exclusive(plan: Plan, context: PlanContext, catalogue: Catalogue, config: S
     visits = [
         (each, place, robots)
         for each in plan.subtasks
-        if each.skill in _LEAVES
+        if _leaves(each, catalogue)
         for place, robots in _visits(each, context, catalogue, config).items()
     ]
     for number, (one, place, robots) in enumerate(visits):
         for other, same, others in visits[number + 1 :]:
             if same != place or robots & others:
                 continue
-            if not (_gone(plan, one, other, before) or _gone(plan, other, one, before)):
+            if not (_gone(plan, one, other, before, catalogue) or _gone(plan, other, one, before, catalogue)):
                 yield (
                     f"{one.id} and {other.id}: {place} is for one robot at a time (safety.exclusive_places): "
                     "have one leave before the other comes"
@@ -173,16 +170,22 @@ def _visits(subtask: Subtask, context: PlanContext, catalogue: Catalogue, config
     return found
 
 
-def _gone(plan: Plan, first: Subtask, then: Subtask, before: dict[str, set[str]]) -> bool:
+def _gone(plan: Plan, first: Subtask, then: Subtask, before: dict[str, set[str]], catalogue: Catalogue) -> bool:
     """Whether the first robot has left for elsewhere before the other comes."""
     return any(
         each.id != first.id
-        and each.skill in _LEAVES
+        and _leaves(each, catalogue)
         and robots_of(each) == robots_of(first)
         and first.id in before[each.id]
         and each.id in before[then.id]
         for each in plan.subtasks
     )
+
+
+def _leaves(subtask: Subtask, catalogue: Catalogue) -> bool:
+    """Whether a robot is no longer where it was after a subtask."""
+    manifest = catalogue.skills.get(subtask.skill)
+    return manifest is not None and manifest.moves_robot and not manifest.flying
 
 
 def places_of(subtask: Subtask) -> list[str]:

@@ -23,9 +23,6 @@ MAX_TEXT = 500
 MAX_ITEMS = 64
 MAX_SECONDS = 86_400.0
 MAX_NUMBER = 1_000_000.0
-JOINT = frozenset({"rendezvous", "form_up", "lift_together", "split_area"})
-"""Skills that several robots do together, listed in `robots`."""
-FLYING = frozenset({"takeoff", "land"})
 
 _ID = re.compile(r"[a-z][a-z0-9_]{0,30}")
 _ROBOT = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
@@ -86,7 +83,7 @@ def able(robot: RobotInfo, manifest: SkillManifest) -> str:
     missing = [use for use in manifest.uses if use not in robot.uses]
     if missing:
         return f"robot {robot.id} has no {' and no '.join(missing)}"
-    if manifest.id in FLYING and not robot.flies:
+    if manifest.flying and not robot.flies:
         return f"robot {robot.id} does not fly"
     lacking = [verb for verb in manifest.verbs if verb not in robot.verbs]
     if lacking:
@@ -188,7 +185,7 @@ def _robot(subtask: Subtask, manifest: SkillManifest, roster: dict[str, RobotInf
         yield "no robot is named: name one, or any"
     else:
         yield from _named(subtask.robot, manifest, roster)
-    if manifest.id in JOINT and isinstance(listed := subtask.params.get("robots"), list | tuple):
+    if manifest.joint and isinstance(listed := subtask.params.get("robots"), list | tuple):
         names = [each for each in listed[:MAX_ITEMS] if isinstance(each, str)]  # pyright: ignore[reportUnknownVariableType]
         for name in names:
             if name != subtask.robot:

@@ -18,7 +18,7 @@ from appliance.llm.safety.quoting import MOST, quoted
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.llm.settings import PlanContext
 from appliance.model import Place, Plan, Pose, RobotInfo, Severity, Site, Subtask
-from appliance.skills.catalogue import Catalogue
+from appliance.skills.catalogue import Catalogue, load_catalogue
 
 
 def step(name: str, skill: str, robot: str | None = "rover_1", *after: str, **params: object) -> Subtask:
@@ -289,7 +289,7 @@ def test_whom_a_robots_task_may_command(policy: str, allowed: bool, ask: Ask, ca
 )
 def test_orders_that_contradict_each_other(subtasks: tuple[Subtask, ...], contradicts: bool) -> None:
     """Only what is certain: one robot in two places at once, or one thing opened and closed at once."""
-    assert bool(tuple(contradictions(plan(*subtasks)))) is contradicts
+    assert bool(tuple(contradictions(plan(*subtasks), load_catalogue()))) is contradicts
 
 
 def test_each_robot_with_a_thing_of_its_own_does_not_contradict() -> None:
@@ -302,7 +302,7 @@ def test_each_robot_with_a_thing_of_its_own_does_not_contradict() -> None:
             step(f"b{number}", "switch_off", f"r{number}", f"a{number}", object="headlight"),
         )
     ]
-    assert not tuple(contradictions(plan(*pairs)))
+    assert not tuple(contradictions(plan(*pairs), load_catalogue()))
 
 
 @pytest.mark.parametrize(
