@@ -58,7 +58,6 @@ CONDITIONS = _set(
     "condition granted given lest in-case"
 )
 """Words that make an order depend on the world."""
-STANDING = _set("whenever always forever constantly continuously continually")
 TIMES = _set(
     "tomorrow tonight today yesterday later noon midnight midday morning afternoon evening night daily hourly nightly "
     "weekly monthly monday tuesday wednesday thursday friday saturday sunday week month year clock strikes am pm a.m "
@@ -90,9 +89,6 @@ SEQUENCE = _set("then afterwards next finally subsequently lastly thereafter the
 """Words between an order and the one that follows it."""
 SIDE_BY_SIDE = _set("while whilst meanwhile simultaneously")
 """Words between orders that run at the same time."""
-COURTESY = _set("could can would will please kindly may")
-"""First words of a polite order that ends in a question mark."""
-QUESTION_WORDS = _set("what where why when who whose which how is are was were do does did has have should shall am")
 UNITS = _set(
     "m metre metres meter meters cm km s sec secs second seconds min mins minute minutes h hr hrs hour hours ft foot "
     "feet mph kmh kph mps knot knots degree degrees deg percent yard yards mile miles inch inches day days ms"

@@ -89,11 +89,6 @@ def nearest(name: str, site: Site) -> str:
     return found[0] if found else ""
 
 
-def extent(site: Site) -> Box | None:
-    """Return the fence; where there is none, None."""
-    return site.fence
-
-
 def outside(place: Place, site: Site) -> str:
     """Return why a point cannot be gone to: outside the fence, or above or below what the site allows; "" if it can."""
     fence = site.fence
