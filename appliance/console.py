@@ -5,11 +5,12 @@ Rich finds out whether it writes to a terminal: without one there are no colours
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Console, ConsoleOptions, Group, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -41,9 +42,26 @@ from appliance.tasks.replay import ReplayReport
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
 
+_CONTROLS = {
+    code: "\ufffd"
+    for code in (*range(0x20), *range(0x7F, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+    if chr(code) not in "\n\t"
+}
+"""Control characters and direction overrides, which a terminal obeys instead of showing them."""
+
+
+class SafeConsole(Console):
+    """A console that shows control characters of texts as `\ufffd`; its own styles and controls pass."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Render with each text freed of control characters: an instruction may hold escape sequences."""
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else text.translate(_CONTROLS), style, control)
+
+
 # No text of a user is markup: an instruction may hold "[/red]" or ":warning:".
-out = Console(highlight=False, markup=False, emoji=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-err = Console(
+out = SafeConsole(highlight=False, markup=False, emoji=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = SafeConsole(
     stderr=True, highlight=False, markup=False, emoji=False, width=None if sys.stderr.isatty() else PIPE_WIDTH
 )
 
@@ -270,6 +288,8 @@ def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
         state = "draining" if each.draining else each.pool_problem or "up"
         if not each.limits_enforced:
             state += ", container limits not enforced"
+        if each.site_problem:
+            state += f", {each.site_problem}"
         table.add_row(
             each.id,
             f"{each.load:.0%}",

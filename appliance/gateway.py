@@ -84,6 +84,7 @@ class Gateway:
         self._draining = False
         self._kept = Kept(config.id)
         """The last lines about tasks that this gateway has said."""
+        self._site_problem = ""
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -96,6 +97,7 @@ class Gateway:
     async def _start(self) -> None:
         config = self.config
         catalogue, site = self._load()
+        self._site_problem = "" if site.fence is not None else f"site {site.name} has no fence"
         self._make_directories()
         self.plane = await Plane.open(config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data)
         self._stack.push_async_callback(self.plane.close)
@@ -383,6 +385,7 @@ class Gateway:
             searches=dict(self._remote.searches),
             limits_enforced=self.pool.limits_enforced,
             pool_problem=self.pool.problem or self.pool.squeeze,
+            site_problem=self._site_problem,
             images=self._storage.images(),
             volumes=self._storage.volumes(),
             models=self.decomposer.models,

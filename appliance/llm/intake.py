@@ -84,6 +84,12 @@ def explained(instruction: str) -> str:
 def stop_refused(stop: StopRequest) -> RefusedError:
     """Return the error for a text that is a soft stop: never planned, but carried out by a person's command."""
     who = " ".join(stop.robots)
+    if stop.unknown and not who:
+        names = ", ".join(stop.unknown)
+        return RefusedError(
+            f"this is a stop, not a task, of a robot that the fleet has not: {names}",
+            remedy="swiftbot stop ROBOT halts one, swiftbot stop halts all; swiftbot robots lists their names",
+        )
     return RefusedError(
         f"this is a stop, not a task{f' (of {who})' if who else ''}", remedy=f"swiftbot stop {who}".rstrip()
     )

@@ -101,6 +101,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """False where the kernel's cgroups do not let rootless containers be limited."""
     pool_problem: str = ""
     """Why the pool cannot start containers, or holds fewer than it may for want of memory; empty when all is well."""
+    site_problem: str = ""
+    """What the site's map lacks to keep robots on it, such as a fence; empty when all is well."""
     images: tuple[str, ...] = ()
     """References of the images it has and can give to others."""
     volumes: tuple[VolumeInfo, ...] = ()

@@ -3,6 +3,7 @@
 import types
 from collections.abc import Callable, Mapping
 from enum import Enum
+from io import StringIO
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -10,9 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import Struct
+from rich.text import Text
 
 from appliance import cli, console, reasons
 from appliance.cli import links, records, steer
+from appliance.console import SafeConsole
 from appliance.console_plan import analysis_text, experience_table, provenance_text
 from appliance.console_watch import revision_lines, stream_line
 from appliance.errors import RefusedError
@@ -161,3 +164,15 @@ def test_commands_print_it_as_it_is(
     said = capsys.readouterr()
     assert ended.value.code == code
     assert "".join(CRASHES.split()) in "".join((said.out + said.err).split())
+
+
+def test_control_characters_of_a_text_reach_no_terminal() -> None:
+    """Escape sequences, bells and direction overrides in an instruction are shown as such; styles still work."""
+    stream = StringIO()
+    shown = SafeConsole(file=stream, force_terminal=True, color_system="standard", width=120, legacy_windows=False)
+    shown.print(Text("go \x1b[2J\x07\x9b31m\u202eback", style="red"), markup=False)
+    text = stream.getvalue()
+    assert text.startswith("\x1b[31m")
+    assert "\x1b[2J" not in text
+    assert not set("\x07\x9b\u202e") & set(text)
+    assert "go \ufffd[2J\ufffd31m\ufffdback" in text

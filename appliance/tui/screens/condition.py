@@ -69,6 +69,9 @@ def notes_of(gateway: Gateway) -> list[Note]:
         text = "container limits are not enforced (no cgroups)"
         remedy = "`swiftbot doctor`"
         found.append(Note(weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
+    if each.site_problem:
+        text, remedy = safe(each.site_problem), "add [fence] to the site's file: points outside it are then refused"
+        found.append(Note(weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
     if refused := sum(each.refused.values()):
         kinds = ", ".join(f"{safe(kind, 40)} {count}" for kind, count in sorted(each.refused.items()))
         text = f"{refused} bad inputs refused ({kinds})"

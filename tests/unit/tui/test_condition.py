@@ -67,6 +67,7 @@ SICK = [
     GatewayStatus(id="g", fleet="f", overloaded="load 1.00 for 5 s"),
     GatewayStatus(id="g", fleet="f", draining=True, drain="gives 2 runs away"),
     GatewayStatus(id="g", fleet="f", limits_enforced=False),
+    GatewayStatus(id="g", fleet="f", site_problem="site yard has no fence"),
 ]
 
 
