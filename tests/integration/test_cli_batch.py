@@ -83,3 +83,32 @@ def test_text_and_batch_together_are_refused(tmp_path: Path, project_root: Path)
         )  # fmt: skip
         assert done.returncode == 2, done.stderr
         assert "remedy" in done.stderr
+
+
+def test_a_folder_of_ones_own_is_a_skill_that_is_planned(tmp_path: Path, project_root: Path) -> None:
+    """A skill that only its folder knows is planned by its phrases, reviewed, and refused where words forbid it."""
+    config = tmp_path / "gateway.toml"
+    config.write_text(f'id = "gw-1"\nskills = ["{project_root / "docs" / "examples" / "skills"}"]\n')
+    asked = {
+        "alone": "rover_1: check the battery",
+        "chained": "Rover_1, go to dock 1, then check the battery",
+        "courteous": "drone_1, could you please look at the battery?",
+        "forbidden": "rover_1: do not check the battery",
+        "excepted": "Rover_1, go to dock 1 but do not check the battery",
+    }
+    file, out = tmp_path / "cases.jsonl", tmp_path / "out.jsonl"
+    lines = [{"id": name, "instruction": text, "robots": ["rover_1", "drone_1"]} for name, text in asked.items()]
+    file.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    more = ("--config", str(config), "--site", "warehouse", "--json")
+    done = subprocess.run(
+        command("--batch", str(file), "--out", str(out), *more),
+        env=environment(project_root), capture_output=True, check=False, timeout=PATIENCE_S,
+    )  # fmt: skip
+    found = {each["id"]: each for each in map(json.loads, out.read_text().splitlines())}
+    assert set(found) == set(asked), done.stderr
+    skills = {name: [each["skill"] for each in line["subtasks"]] for name, line in found.items()}
+    assert [found[name]["decision"] for name in ("alone", "chained", "courteous")] == ["run"] * 3
+    assert skills["alone"] == skills["courteous"] == ["battery_check"]
+    assert skills["chained"] == ["goto", "battery_check"]
+    assert found["forbidden"]["decision"] in ("hold", "refuse")
+    assert found["excepted"]["decision"] in ("hold", "refuse") or skills["excepted"] == ["goto"]

@@ -11,6 +11,7 @@ from msgspec import Struct, field
 
 from appliance.llm.rules import lexicon as lx
 from appliance.llm.rules import modifiers, names
+from appliance.llm.rules.added import AddedSkills
 from appliance.llm.rules.grammar import steps_of
 from appliance.llm.rules.graph import Mentions
 from appliance.llm.rules.phrases import PICTURES, Step
@@ -82,6 +83,7 @@ class Reader:
 
     def __init__(self, catalogue: Catalogue, who: names.Names, known_place: Any, quotes: list[str]) -> None:
         self.catalogue = catalogue
+        self._added = AddedSkills.of(catalogue)
         self.names = who
         self.mentions = Mentions()
         self._known_place = known_place
@@ -231,7 +233,7 @@ class Reader:
                 found.append((who, rest))
         first = text.split(maxsplit=1)[0].lower() if text.split() else ""
         elided = (Who(), text)
-        verb_first = first in lx.LEMMA
+        verb_first = first in lx.LEMMA or first in self._added.verbs
         subjects = self._named(text)
         return found + ([elided, *subjects] if verb_first else [*subjects, elided])
 
@@ -283,6 +285,8 @@ class Reader:
         parts = text.split(None, 1)
         if not parts:
             return None
+        if self._added and (found := self._by_phrase(text)):
+            return found
         lemma = lx.LEMMA.get(lx.spell(parts[0]).lower().strip(",:"))
         if lemma is None:
             return self._nominal(text) if not explicit or re.search(r"\b(?:of|scan)\b", text) else None
@@ -295,6 +299,13 @@ class Reader:
             tail = re.sub(rf"^(?=(?:about |another )?{lx.NUMBER} ?{lx.TIME_UNIT})", "for ", tail, flags=re.IGNORECASE)
         rest, quantities = modifiers.take(tail, altitude=lifted)
         return self._match(lemma, rest, quantities)
+
+    def _by_phrase(self, text: str) -> tuple[list[Step], str, float, dict[str, Any]] | None:
+        """Read a clause by the phrases of skills that are not built in."""
+        rest, quantities = modifiers.take(text, altitude=False)
+        if (step := self._added.step(rest, self)) is None:
+            return None
+        return [step], "", self._give_quantities([step], quantities) + self._doubt([step]), quantities.values
 
     def _nominal(self, text: str) -> tuple[list[Step], str, float, dict[str, Any]] | None:
         """Read "three photos of the stage", "thermal scan of X", "frames at 12 fps"."""
