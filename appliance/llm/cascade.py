@@ -19,7 +19,6 @@ import structlog
 
 from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError, SwiftbotError
 from appliance.llm.analysis import Analysis, analyse
-from appliance.llm.checks.reading import with_names
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.completion import completed
 from appliance.llm.experience.memory import Memory
@@ -27,6 +26,7 @@ from appliance.llm.figures import Figures
 from appliance.llm.intake import explained, no_plan, refused, stop_refused
 from appliance.llm.peers import ProposeAsk, Proposed
 from appliance.llm.review import Facts, Review, reasons, review
+from appliance.llm.rewriting import told
 from appliance.llm.routing.budget import Budget
 from appliance.llm.routing.canonical import catalogue_digest, digest, plan_key
 from appliance.llm.routing.gate import Gate
@@ -205,14 +205,15 @@ class Decomposer:
         if (stop := stop_request(context.instruction, [each.id for each in context.robots or ()])) is not None:
             raise stop_refused(stop)
 
+        words = told(context)
+
         def judge(plan: Plan, confidence: float, run_from: float) -> tuple[Plan, Review]:
-            whole, added = completed(plan, context, self._catalogue)
+            whole, added = completed(words.restored(plan), context, self._catalogue)
             found = self._review(whole, context, confidence=confidence, run_from=run_from, added=added)
             return whole, found
 
-        # Planners are told of robots by name; the review goes by the words as they were typed.
-        named = with_names(context.instruction, context.robots)
-        return await self._turn(msgspec.structs.replace(context, instruction=named), judge)
+        # The review goes by the words as they were typed, and by the whole roster.
+        return await self._turn(context, judge, words.context(context))
 
     async def replan(
         self,
@@ -275,11 +276,12 @@ class Decomposer:
 
     # --- the way through the tiers ------------------------------------------------------------------------------
 
-    async def _turn(self, context: PlanContext, judge: Judge) -> PlanOutcome:
+    async def _turn(self, context: PlanContext, judge: Judge, asked: PlanContext | None = None) -> PlanOutcome:
+        """Plan by the cache, else by the tiers, which are asked with `asked`."""
         began = time.monotonic()
         async with self._gate.turn():
             key = plan_key(context, catalogue=self._catalogue_digest, policy=self._policy_digest)
-            found = self._cached(key, judge) or await self._cascade(context, judge)
+            found = self._cached(key, judge) or await self._cascade(asked or context, judge)
         plan = found.plan
         self._figures.planned(plan.tier, found.attempts)
         provenance = Provenance(

@@ -17,6 +17,8 @@ from appliance.model import Plan, Subtask
 from appliance.skills.catalogue import Catalogue
 
 _POLICY = SafetyConfig()
+WAY = "goto"
+"""The skill that takes a robot to a place."""
 
 
 def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> tuple[Plan, frozenset[str]]:
@@ -32,9 +34,8 @@ def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> tuple[P
     if len({each.id for each in plan.subtasks}) != len(plan.subtasks) or len(plan.subtasks) > 63:
         return plan, frozenset()
     facts = Facts(plan, context, catalogue, _POLICY)
-    bound = _bound(facts)
-    if bound is not plan:
-        facts = Facts(bound, context, catalogue, _POLICY)
+    for step in (_bound, _sent):
+        facts = Facts(step(facts), context, catalogue, _POLICY)
     return _with_ways(facts)
 
 
@@ -56,10 +57,27 @@ def _bound(facts: Facts) -> Plan:
     return replace(facts.plan, subtasks=subtasks)
 
 
+def _sent(facts: Facts) -> Plan:
+    """Send a robot to a place of the site that is all that the words say: no words ask for more than the way there."""
+    subtasks = tuple(_way_only(facts, each) for each in facts.plan.subtasks)
+    return replace(facts.plan, subtasks=subtasks) if subtasks != facts.plan.subtasks else facts.plan
+
+
+def _way_only(facts: Facts, subtask: Subtask) -> Subtask:
+    manifest, values = facts.manifest(subtask), list(subtask.params.values())
+    if manifest is None or facts.site is None or subtask.skill == WAY or WAY not in facts.catalogue.skills:
+        return subtask
+    stays = manifest.moves_robot and set(manifest.uses) == {"base"} and not facts.account.called[subtask.id]
+    place = values[0] if len(values) == 1 and isinstance(values[0], str) else ""
+    if not stays or not place or facts.site.find(place) is None or not facts.account.values[subtask.id]:
+        return subtask
+    return replace(subtask, skill=WAY, params={"place": place})
+
+
 def _with_ways(facts: Facts) -> tuple[Plan, frozenset[str]]:
     """Send a robot to where it takes or puts down a thing, where the plan sends it nowhere for that."""
     none = facts.plan, frozenset[str]()
-    if facts.site is None or "goto" not in facts.catalogue.skills:
+    if facts.site is None or WAY not in facts.catalogue.skills:
         return none
     ways: dict[str, Subtask] = {}
     while len(ways) < 16:
@@ -67,7 +85,7 @@ def _with_ways(facts: Facts) -> tuple[Plan, frozenset[str]]:
         if missing is None:
             break
         way = Subtask(
-            id=f"way{len(ways) + 1}", skill="goto", robot=missing.robot, params={"place": away(facts, missing)},
+            id=f"way{len(ways) + 1}", skill=WAY, robot=missing.robot, params={"place": away(facts, missing)},
             after=missing.after,
         )  # fmt: skip
         ways[way.id] = way

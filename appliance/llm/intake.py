@@ -44,7 +44,7 @@ _KNOWN = {name: frozenset(words.split()) for name, words in _LANGUAGES.items()}
 _ENGLISH = _KNOWN.pop("English")
 _QUESTION = re.compile(
     r"^(?:so |and |hey |well )?(?:what(?:'s| is| are| was| do| does| did)|who(?:'s| is| are| am)|why|when(?:'s| is)|"
-    r"how (?:are|is|do you|old|much is)|are you|do you|is there (?:a )?(?:god|life)|will you|would you|"
+    r"how (?:are|is|do you|old|much is)|are you|do you|is there (?:a )?(?:god|life)|"
     r"tell me (?:a|about) )\b",
     re.IGNORECASE,
 )

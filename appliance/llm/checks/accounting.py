@@ -28,7 +28,7 @@ _PARTICLES = frozenset(
     ("up", "down", "on", "off", "out", "back", "away", "over", "in", "together", "around", "for", "to", "at", "know")
 )
 _IRREGULAR = {
-    "go": ("goes", "going", "gone"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
+    "go": ("goes", "going", "gone", "went"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
     "put": ("puts", "putting"), "bring": ("brings", "bringing", "brought"), "drive": ("drives", "driving", "driven"),
     "get": ("gets", "getting"), "give": ("gives", "giving", "given"), "shoot": ("shoots", "shooting"),
     "say": ("says", "saying", "said"),
@@ -118,6 +118,8 @@ def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | Non
             elif said is None:
                 found.unsaid.append((subtask.id, name, str(value)))
     _heads(reading, plan, found)
+    for subtask in plan.subtasks:
+        _param_words(reading, subtask, found, names=("place",))
     _phrases(reading, plan, catalogue, found)
     for subtask in plan.subtasks:
         # "until Eva confirms", "when the doorbell rings": what is waited for follows the word that says so.
@@ -197,6 +199,8 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
                     break
                 if not (_ends_quantity(window[-1]) if unit else _ends_number(window[-1])):
                     continue
+                if unit == "mps" and not any(each.text in _PER for each in window):
+                    continue  # "a metre at a time" is no speed
                 said = quantity(reading.text[window[0].start : window[-1].end], unit)
                 if said is not None and abs(float(said) - value) <= 1e-3 * max(1.0, abs(value)):
                     best = length
@@ -207,6 +211,8 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
     return found or None
 
 
+_PER = frozenset(("/", "per", "mps", "mph", "kmh", "kph", "knot", "knots"))
+"""What makes a figure a speed."""
 _ENDS = frozenset((";", "?", "!", "\n", ","))
 
 
@@ -440,11 +446,25 @@ def claims(reading: Reading, catalogue: Catalogue, *, taken: Iterable[int] = ())
         options: list[Claim] = []
         for words, skills in table.get(token.text, ()):
             at = _phrase_at(reading, start, words, kept)
+            # "take drone_1 to the gate": a robot that is brought somewhere goes there itself.
+            brought = start + 1 < len(tokens) and tokens[start + 1].kind == "robot" and _carries(skills, catalogue)
             if at:
-                options.append(Claim(at, " ".join(tokens[index].text for index in at), skills))
+                text = " ".join(tokens[index].text for index in at)
+                options.append(Claim(at, text, skills | _ways(catalogue) if brought else skills))
         if options:
             found.append(options)
     return found
+
+
+def _ways(catalogue: Catalogue) -> frozenset[str]:
+    """The skills by which a robot goes somewhere on behalf of others."""
+    return frozenset(
+        each.id for each in catalogue.skills.values() if each.moves_robot and each.incidental and not each.flying
+    )
+
+
+def _carries(skills: Iterable[str], catalogue: Catalogue) -> bool:
+    return any("load" in (*catalogue.skills[each].ties, *catalogue.skills[each].frees) for each in skills)
 
 
 def _phrase_at(reading: Reading, start: int, words: Sequence[str], taken: set[int]) -> tuple[int, ...]:
@@ -457,7 +477,7 @@ def _phrase_at(reading: Reading, start: int, words: Sequence[str], taken: set[in
             continue
         while (
             index < len(tokens)
-            and (tokens[index].text in ARTICLES or tokens[index].value is not None)
+            and (tokens[index].text in ARTICLES or tokens[index].value is not None or tokens[index].kind == "robot")
             and tokens[index].text != word
         ):
             index += 1
@@ -529,11 +549,11 @@ def _weight(text: str) -> int:
 _WEAK = frozenset(("for", "at", "to", "in", "the", "a", "an", "of", "into", "with"))
 
 
-def _param_words(reading: Reading, subtask: Subtask, found: Account) -> None:
+def _param_words(reading: Reading, subtask: Subtask, found: Account, *, names: Iterable[str] | None = None) -> None:
     """Cover the words that come with a parameter next to its value: "for", "laps", "at a height of"."""
     said = found.values[subtask.id]
-    for name in subtask.params:
-        words = _PARAM_WORDS.get(name, ())
+    for name in subtask.params if names is None else names:
+        words = _PARAM_WORDS.get(name, ()) if name in subtask.params else ()
         for number, token in enumerate(reading.tokens):
             if token.text in words and number not in found.covered and _near(number, said, reading):
                 found.covered.add(number)

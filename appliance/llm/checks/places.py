@@ -23,6 +23,8 @@ COORDINATE = re.compile(
     rf"(?:\s*[,; ]\s*z?\s*=?\s*({_NUMBER})\s*m?)?\s*\)?"
 )
 _IN_BRACKETS = re.compile(r"\([^()]*\)")
+_PAIR = re.compile(rf"(?:^|[(;>]|\b(?:to|via|at|from|through|then|and)\s)\s*({_NUMBER})\s*,\s*({_NUMBER})(?![\w.])")
+"""A pair of figures that a route names as a point."""
 _SPLIT = re.compile(r"[,;]|->|→|\b(?:then|and|via|to|from)\b")
 """What stands between the places of a route, as the skills read it."""
 
@@ -69,7 +71,7 @@ def known_as(name: str, site: Site | None) -> tuple[str, ...]:
 
 def parts_of(text: str) -> list[str]:
     """Return what a text names: itself, and the places of it if it is a route such as "goal 1, aisle then (12, 7)"."""
-    parts = [text, *_IN_BRACKETS.findall(text)]
+    parts = [text, *_IN_BRACKETS.findall(text), *(f"{each[0]}, {each[1]}" for each in _PAIR.findall(text))]
     if not COORDINATE.fullmatch(text.strip()):
         parts += _SPLIT.split(_IN_BRACKETS.sub(";", text))
     return list(dict.fromkeys(name for each in parts[:MOST_PARTS] if (name := bare(each))))
@@ -135,7 +137,7 @@ def place_problems(subtask: Subtask, site: Site, *, moves: bool = True) -> Itera
     for key in ("path", "area", "target", "asset"):
         text = params.get(key)
         if moves and isinstance(text, str):
-            for part in (text, *_IN_BRACKETS.findall(text)):
+            for part in parts_of(text):
                 found = coordinate(part)
                 if found is not None:
                     yield from _point(found, part, site)

@@ -261,18 +261,6 @@ def _matches(tokens: Sequence[Token], at: int, parts: Sequence[str]) -> int:
     return index
 
 
-def with_names(instruction: str, robots: Sequence[RobotInfo] | None) -> str:
-    """Return an instruction with names of robots for their kinds: "the drone" is drone_1, where there is one."""
-    found = read(instruction, robots)
-    if normalise(instruction)[0] != instruction or not robots:
-        return instruction
-    text = instruction
-    for token in reversed(found.tokens):
-        if token.group == "one" and len(token.robots) == 1 and token.text != token.robots[0]:
-            text = f"{text[: token.start]}{token.robots[0]}{text[token.end :]}"
-    return text
-
-
 _Robot = tuple[str, bool]
 """Id, and whether it flies."""
 
@@ -333,7 +321,7 @@ def _group(
         if word in _GROUP or (word in _ONE_OF and not lead):
             lead = lead or word
         elif tokens[index].value is not None and index > at - 1 and word not in KINDS:
-            count = tokens[index].value
+            count = tokens[index].value if count is None else min(count, tokens[index].value or count)
         elif word in _BETWEEN:
             other = other or word == "other"
             lead = lead or ("the" if word == "the" else "")

@@ -30,9 +30,17 @@ _DELAYED = re.compile(
 _REPEATED = re.compile(
     r"\b(?:every|each)\s+(?:other\s+|few\s+|\d+\s+|half\s+|two\s+|three\s+|five\s+|ten\s+|fifteen\s+|thirty\s+)*"
     r"(?:hour|minute|min|second|sec|day|night|morning|evening|afternoon|week|month|shift|time|monday|tuesday|wednesday|"
-    r"thursday|friday|saturday|sunday)s?\b|\b(?:twice|once|three times)\s+(?:a|an|per|each|every)\s+\w+",
+    r"thursday|friday|saturday|sunday)s?\b|"
+    r"\b(?:twice|once|three times)\s+(?:a|an|per|each|every)\s+\w+",
     re.IGNORECASE,
 )
+_OFTEN = re.compile(
+    r"\bfrom time to time\b|\bnow and (?:then|again)\b|\b(?:once )?in a while\b|\bevery (?:so often|now and then)\b|"
+    r"\b(?:on and off|off and on)\b|\bat (?:regular )?intervals\b|\bround the clock\b|\btime and again\b|"
+    r"\bover and over\b|\bday (?:and|in,? day) (?:night|out)\b",
+    re.IGNORECASE,
+)
+"""Idioms of repeats: each of their words means nothing by itself."""
 _CLAUSE_END = frozenset((",", ";", ".", "!", "?", ":", "\n", "–", "—"))
 _SMALL = frozenset(
     (",", ";", ".", "!", "?", ":", "\n", "=", "-", "–", "—", "(", ")", "&", "'", "/", "*", "•", "_", "…", '"', "+")
@@ -98,7 +106,7 @@ def _phrased(facts: Facts) -> set[int]:
         return set(kept)
     found: set[int] = set()
     tokens = facts.reading.tokens
-    texts = [each.text for each in tokens]
+    texts = ["ROBOT" if each.kind == "robot" else each.text for each in tokens]
     for words in _filler_phrases():
         for start in range(len(texts) - len(words) + 1):
             if texts[start] == words[0] and tuple(texts[start : start + len(words)]) == words:
@@ -136,7 +144,9 @@ def _scopes(facts: Facts) -> list[Scope]:
     filler = _phrased(facts)
     found: list[Scope] = []
     behind = 0
-    options = claims(facts.reading, facts.catalogue)
+    named = set[int]().union(*account.values.values()) if account.values else set[int]()
+    options = claims(facts.reading, facts.catalogue, taken=named)
+    open_ended = lx.ALTERNATIVES | lx.CONDITIONS
     for number, token in enumerate(tokens):
         if number < behind or token.kind != "word" or token.text not in lx.NEGATIONS or number in filler:
             continue
@@ -157,6 +167,7 @@ def _scopes(facts: Facts) -> list[Scope]:
         alone = token.text in ("no", "nope") and number + 1 < len(tokens) and tokens[number + 1].kind == "mark"
         same = any(_may_do(facts, each, asked, inside, who) for each in facts.plan.subtasks)
         kept = bool(asked) and not broken and not alone and not same
+        kept = kept and not any(tokens[index].text in open_ended for index in at)
         words = facts.words(at)
         found.append(
             Scope(
@@ -361,6 +372,9 @@ def time(facts: Facts) -> Iterable[Finding]:
         inside = [n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()]
         if inside and any(index in rest and tokens[index].text not in lx.FILLERS for index in inside):
             found += inside
+    free = _free_values(facts)
+    for match in _OFTEN.finditer(text):
+        found += [n for n, each in enumerate(tokens) if match.start() <= each.start < match.end() and n not in free]
     if found:
         words = facts.words(sorted(set(found)))
         yield Finding(
@@ -399,15 +413,36 @@ def alternative(facts: Facts) -> Iterable[Finding]:
             return
 
 
+_BACK = re.compile(
+    r"\bno,? wait\b|\bwait,? no\b|\bmake that\b|\bhang on\b|\bhold on\b|\bon second thoughts?\b|\bcome to think\b|"
+    r"\bchange of plans?\b|\bstrike that\b|\bforget (?:that|it|what)\b|\bthat is to say\b|\bnever ?mind\b",
+    re.IGNORECASE,
+)
+"""Idioms that take back what was said before."""
+
+
 def correction(facts: Facts) -> Iterable[Finding]:
     """A correction in mid-sentence is looked at by a person."""
     tokens = facts.reading.tokens
+    if back := _BACK.search(facts.reading.text):
+        inside = {n for n, each in enumerate(tokens) if back.start() <= each.start < back.end()}
+        if not inside & _free_values(facts):
+            yield _hold("correction", f'"{back.group()}" takes something back', (back.group(),),
+                        hint="say the order once, as it is meant")  # fmt: skip
+            return
     phrased = _phrased(facts)
     for number in left(facts):
         if tokens[number].kind == "word" and tokens[number].text in lx.CORRECTIONS and number not in phrased:
             yield _hold("correction", f'"{tokens[number].text}" takes something back', (tokens[number].text,),
                         hint="say the order once, as it is meant")  # fmt: skip
             return
+        if tokens[number].text == "*" and not _opens_line(tokens, number):
+            yield _hold("correction", '"*" takes something back', ("*",), hint="say the order once, as it is meant")
+            return
+
+
+def _opens_line(tokens: Sequence[Token], number: int) -> bool:
+    return number == 0 or tokens[number - 1].text == "\n"
 
 
 def question(facts: Facts) -> Iterable[Finding]:
@@ -446,6 +481,8 @@ def question(facts: Facts) -> Iterable[Finding]:
 
 def _courteous(words: Sequence[str]) -> bool:
     body = [each for each in words if each not in ("hey", "hi", "hello", "ok", "okay", "so", "and", "then", "please")]
+    if body[:1] == ["mind"] or (body[:1] == ["would"] and "mind" in body[1:3]) or words[-1:] == ["please"]:
+        return True
     return len(body) > 1 and body[0] in ("could", "can", "would", "will") and body[1] in (
         "you", "somebody", "someone", "we", "i", "one",
     )  # fmt: skip
@@ -530,10 +567,16 @@ def names(facts: Facts) -> Iterable[Finding]:
         if subtask.id in facts.added:
             continue
         for name, value in subtask.params.items():
-            if not isinstance(value, str) or name == "path":
+            if not isinstance(value, str):
+                continue
+            if name == "path":
+                if words := sorted(set(value.lower().split()) & _NOT_IN["path"]):
+                    yield _hold("names", f'{subtask.id}: "{words[0]}" is no place of a path', tuple(words))
                 continue
             known = facts.site is not None and facts.site.find(value) is not None
-            if value.lower() in ("him", "her", "them", "it", "there"):
+            if value.lower() in ("him", "her", "them", "it", "there") or (
+                not known and name not in FREE and value.lower() in _CHANGING
+            ):
                 yield _hold("names", f'{subtask.id}: {name} "{value}" names nobody and nothing', (value,))
             if name in FREE:
                 last = re.findall(r"[\w']+|\.\.\.", value.lower())[-1:]
@@ -543,15 +586,42 @@ def names(facts: Facts) -> Iterable[Finding]:
                 if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
                     yield _hold("names", f"{subtask.id}: a robot cannot speak to the operator: notify does", ())
                 words = set(re.findall(r"[a-z]+", value.lower()))
-                if name == "event" and words <= _NO_EVENT:
+                if name == "event" and (words <= _NO_EVENT or value.lower().split()[-1] in lx.DURATIONS):
                     yield _hold("names", f'{subtask.id}: "{value}" is nothing that happens', (value,))
+            elif name in _PLACES and not known and (shorter := _known_part(facts, value)):
+                yield _hold("names", f'{subtask.id}: {name} "{value}" is more than {shorter}', (value,))
             elif (
-                not known and coordinate(value) is None and (set(value.lower().split()) & lx.IN_NO_NAME or "," in value)
+                not known
+                and coordinate(value) is None
+                and (set(value.lower().split()) & _NOT_IN.get(name, lx.IN_NO_NAME) or "," in value)
             ):
                 yield _hold("names", f'{subtask.id}: {name} "{value}" is more than a name', (value,))
     for subtask, name, value in facts.account.unsaid:
         if name not in FREE and subtask not in facts.added and value not in ("operator", "home"):
             yield _hold("names", f'{subtask}: no words say {name} "{value}"', (value,))
+
+
+_PLACES = frozenset(("place", "area", "station", "at"))
+"""Parameters that name a place."""
+
+
+_NOT_IN: dict[str, frozenset[str]] = dict.fromkeys(
+    _PLACES, lx.IN_NO_NAME | {"with", "exception", "beside", "besides", "apart", "minus", "short"}
+)
+
+
+_NOT_IN["path"] = lx.BY_THE_WAY | lx.TIMES | {"with", "exception", "unless", "except", "without", "than", "for"}
+
+
+_CHANGING = lx.NEGATIONS | lx.EXCEPTIONS | lx.CONDITIONS | lx.ALTERNATIVES
+"""Words that alone are no name."""
+
+
+def _known_part(facts: Facts, value: str) -> str:
+    """The place of the site that a longer name begins with: what follows it is no part of its name."""
+    words = value.split()
+    shorter = (" ".join(words[:count]) for count in range(len(words) - 1, 0, -1))
+    return next((each for each in shorter if facts.site is not None and facts.site.find(each) is not None), "")
 
 
 # --- words and subtasks --------------------------------------------------------------------------------------------
@@ -757,6 +827,30 @@ def sequence(facts: Facts) -> Iterable[Finding]:
                 return
     yield from _opposites(facts)
     yield from _before_after(facts)
+    yield from _as_said(facts)
+
+
+def _as_said(facts: Facts) -> Iterable[Finding]:
+    """Without words that say otherwise a robot goes about places in the order in which they are said."""
+    tokens, values = facts.reading.tokens, facts.account.values
+    if _reordered(tokens):
+        return
+    by_the_way = next((n for n, each in enumerate(tokens) if each.text in lx.BY_THE_WAY), None)
+    for one in facts.plan.subtasks:
+        for two in facts.plan.subtasks:
+            first, second = values[one.id], values[two.id]
+            if one.id not in facts.before[two.id] or one.robot != two.robot or not first or not second:
+                continue
+            if "base" not in _uses(facts, one) or "base" not in _uses(facts, two):
+                continue
+            late = min(first) > max(second)
+            if by_the_way is None and late and not (first & second):
+                yield _hold("sequence", f"{two.id} ({two.skill}) is said before {one.id} ({one.skill})", ())
+                return
+            if by_the_way is not None and max(first) < by_the_way < min(second):
+                word = tokens[by_the_way].text
+                yield _hold("sequence", f'"{word}" is said, and the plan has another order', (word,))
+                return
 
 
 def _opposites(facts: Facts) -> Iterable[Finding]:
@@ -792,13 +886,27 @@ def repeated(facts: Facts) -> Iterable[Finding]:
         if manifest is not None and manifest.moves_robot:
             seen = [each for each in seen if each[1] != subtask.robot]  # elsewhere the same is another thing
         what = (subtask.skill, subtask.robot, subtask.params)
+        same = sum((each.skill, each.robot, each.params) == what for each in facts.plan.subtasks)
+        said = facts.account.evidence.get(subtask.id, set()) - forbidden(facts)
+        if same > 1 and manifest is not None and manifest.moves_robot and same > _mentions(said) and what not in seen:
+            yield _hold("repeated", f"{subtask.id} ({subtask.skill}) is planned {same} times", ())
         if manifest is not None and not manifest.repeats and what in seen:
             yield _hold("repeated", f"{subtask.id} ({subtask.skill}) is planned twice", ())
         seen.append(what)
 
 
+def _mentions(said: set[int]) -> int:
+    """How often a thing is said: runs of tokens that stand apart."""
+    return sum(each - 1 not in said and each - 2 not in said for each in said)
+
+
 def _reordered(tokens: Sequence[Token]) -> bool:
-    return any(each.text in ("before", "after", "once", "first", "when", "until") for each in tokens)
+    behind = [each.text for each in tokens[1:]] + [""]
+    return any(
+        each.text in ("before", "once", "first", "when", "until", "from")
+        or (each.text == "after" and follows not in ("that", "which", "this", "it", "wards"))
+        for each, follows in zip(tokens, behind, strict=True)
+    )
 
 
 def _before_after(facts: Facts) -> Iterable[Finding]:
