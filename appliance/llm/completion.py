@@ -4,8 +4,11 @@ An order such as "fetch the red box" names no place; the site knows where the bo
 An order that names no robot is given to the one robot that can do it, where there is only one.
 """
 
+import re
+
 from msgspec.structs import replace
 
+from appliance.llm.checks.accounting import text_said
 from appliance.llm.checks.finding import Facts
 from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.robots import candidates
@@ -34,7 +37,7 @@ def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> tuple[P
     if len({each.id for each in plan.subtasks}) != len(plan.subtasks) or len(plan.subtasks) > 63:
         return plan, frozenset()
     facts = Facts(plan, context, catalogue, _POLICY)
-    for step in (_bound, _sent):
+    for step in (_bound, _sent, _met):
         facts = Facts(step(facts), context, catalogue, _POLICY)
     return _with_ways(facts)
 
@@ -68,10 +71,52 @@ def _way_only(facts: Facts, subtask: Subtask) -> Subtask:
     if manifest is None or facts.site is None or subtask.skill == WAY or WAY not in facts.catalogue.skills:
         return subtask
     stays = manifest.moves_robot and set(manifest.uses) == {"base"} and not facts.account.called[subtask.id]
+    usual = [str(each.usual) for each in manifest.params.values() if isinstance(each.usual, str)]
     place = values[0] if len(values) == 1 and isinstance(values[0], str) else ""
-    if not stays or not place or facts.site.find(place) is None or not facts.account.values[subtask.id]:
+    if not values and usual and text_said(facts.reading, usual[0], facts.site):
+        place = usual[0]  # "rover_2 is needed at the charger"
+    elif not facts.account.values[subtask.id]:
+        return subtask
+    if not stays or not place or facts.site.find(place) is None:
         return subtask
     return replace(subtask, skill=WAY, params={"place": place})
+
+
+_WHERE = re.compile(r"(.+?) (?:at|in|by|near) (?:the )?(.+)")
+
+
+def _met(facts: Facts) -> Plan:
+    """Send a robot to where somebody is to whom it gives something: "hands it to Ana at the office"."""
+    plan = facts.plan
+    for subtask in plan.subtasks:
+        to = subtask.params.get("to")
+        manifest = facts.manifest(subtask)
+        match = _WHERE.fullmatch(to) if isinstance(to, str) else None
+        if match is None or facts.site is None or manifest is None or "load" not in manifest.frees:
+            continue
+        if facts.site.find(match[2]) is None or WAY not in facts.catalogue.skills or len(plan.subtasks) > 62:
+            continue
+        named = {each.id for each in plan.subtasks}
+        way = Subtask(
+            id=next(f"w{n}" for n in range(1, 99) if f"w{n}" not in named), skill=WAY, robot=subtask.robot,
+            params={"place": match[2]}, after=subtask.after,
+        )  # fmt: skip
+        moved = replace(subtask, params={**subtask.params, "to": match[1]}, after=(way.id,))
+        plan = replace(
+            plan,
+            subtasks=tuple(new for each in plan.subtasks for new in ((way, moved) if each is subtask else (each,))),
+        )
+    return plan if plan is facts.plan else _renumbered(plan)[0]
+
+
+def _renumbered(plan: Plan) -> tuple[Plan, dict[str, str]]:
+    """A plan with the ids s1, s2, ... in the order of its subtasks, and the new id of each old one."""
+    names = {each.id: f"s{number}" for number, each in enumerate(plan.subtasks, start=1)}
+    renamed = tuple(
+        replace(each, id=names[each.id], after=tuple(names.get(other, other) for other in each.after))
+        for each in plan.subtasks
+    )
+    return replace(plan, subtasks=renamed), names
 
 
 def _with_ways(facts: Facts) -> tuple[Plan, frozenset[str]]:
@@ -97,12 +142,8 @@ def _with_ways(facts: Facts) -> tuple[Plan, frozenset[str]]:
         facts = Facts(replace(facts.plan, subtasks=tuple(subtasks)), facts.context, facts.catalogue, _POLICY)
     if not ways:
         return none
-    names = {each.id: f"s{number}" for number, each in enumerate(facts.plan.subtasks, start=1)}
-    renamed = tuple(
-        replace(each, id=names[each.id], after=tuple(names.get(other, other) for other in each.after))
-        for each in facts.plan.subtasks
-    )
-    return replace(facts.plan, subtasks=renamed), frozenset(names[each] for each in ways)
+    plan, names = _renumbered(facts.plan)
+    return plan, frozenset(names[each] for each in ways)
 
 
 def _needs_way(facts: Facts, subtask: Subtask) -> bool:

@@ -22,12 +22,13 @@ _POINT = re.compile(
     rf"(?:\(\s*{_NUMBER}\s*[,;]\s*{_NUMBER}(?:\s*[,;]\s*{_NUMBER})?\s*\)"
     rf"|\bx\s*=?\s*{_NUMBER}\s*m?\s*(?:,|;|and)?\s*y\s*=?\s*{_NUMBER}(?:\s*m\b)?"
     rf"|(?<![\w.,])(?<!\d ){_NUMBER}\s?,\s?{_NUMBER}"
-    r"(?![\w.,]*\d)(?!\s*(?:m\b|m/s|metres?|meters?|seconds?|s\b|laps?|,\s*\d)))",
+    r"(?![\w.,]*\d)(?!\s*(?:m\b|m/s|metres?|meters?|seconds?|s\b|laps?|(?:,|and|&|or)\s*\d)))",
     re.IGNORECASE,
 )
 """A pair of figures that can only be a point: in brackets, with axes, or two figures with nothing but a comma."""
 _LISTED = re.compile(
-    r"\b(?:docks?|goals?|aisles?|bays?|stations?|racks?|rovers?|drones?|robots?|rooms?|numbers?)\s*$", re.IGNORECASE
+    r"\b(?:waypoints?|docks?|goals?|aisles?|bays?|stations?|racks?|rovers?|drones?|robots?|rooms?|numbers?)\s*$",
+    re.IGNORECASE,
 )
 """What stands before figures that are numbers of places: "docks 1, 2"."""
 _OTHERS = frozenset(("other", "others", "another", "rest", "remaining", "else", "second", "latter", "former", "last"))
@@ -82,8 +83,13 @@ def told(context: PlanContext) -> Told:
 def _with_names(text: str, found: Reading, robots: Sequence[RobotInfo] | None) -> str:
     """Return an instruction with names of robots for their kinds: "the drone" is drone_1, where there is one."""
     for token in reversed(found.tokens) if robots else ():
+        said = ""
         if token.group == "one" and len(token.robots) == 1 and token.text != token.robots[0]:
-            text = f"{text[: token.start]}{token.robots[0]}{text[token.end :]}"
+            said = token.robots[0]
+        elif token.group == "all" and len(token.robots) > 1 and any(each.isdigit() for each in token.text):
+            said = f"{', '.join(token.robots[:-1])} and {token.robots[-1]}"
+        if said:
+            text = f"{text[: token.start]}{said}{text[token.end :]}"
     return text
 
 

@@ -487,6 +487,8 @@ def _sentence(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | Non
         return None
     if (heard := _clause(tokens, roster, budget, first=said.first, question="?" in said.mark)) is not None:
         return heard
+    if (heard := _with_reason(said, roster, budget)) is not None:
+        return heard
     commas = [at for at, each in enumerate(tokens) if each == ","]
     for comma in commas[:3]:
         behind = next((each for each in tokens[comma + 1 :] if each != ","), "")
@@ -496,6 +498,29 @@ def _sentence(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | Non
             return heard
     if commas and "!" in said.mark and _CONDITIONAL.isdisjoint(tokens):
         return _clause(tokens[commas[-1] + 1 :], roster, budget, first=False)
+    return None
+
+
+_REASONS = frozenset(
+    re.findall(
+        r"\S+",
+        "there's theres there it's its it he's hes he she's she they're they someone somebody something because "
+        "cause cos cuz from you're youre that's thats",
+    )
+)
+"""Words that begin the reason of a stop: "stop the rover there's a child"."""
+
+
+def _with_reason(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | None:
+    """Return the stop that a sentence begins with where its reason follows without a mark between them."""
+    tokens = said.tokens
+    for at in range(1, min(len(tokens) - 1, 14)):
+        if tokens[at] not in _REASONS or tokens[at : at + 4] == ["from", "time", "to", "time"]:
+            continue
+        heard = _clause(tokens[:at], roster, budget, first=said.first)
+        # "stop something": without robots only a thing that is there is a reason.
+        if heard is not None and (heard.robots or heard.everything or tokens[at].startswith("there")):
+            return heard
     return None
 
 

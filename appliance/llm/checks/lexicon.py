@@ -25,6 +25,10 @@ FILLERS = _set(
 )
 """Words that may stand beside a plan without being in it."""
 FILLER_PHRASES = (
+    "good morning", "good afternoon", "good evening", "good day", "morning !", "morning ,", "evening !", "i . e", "i.e",
+    "i'd appreciate it if", "we'd appreciate it if", "it'd be good if", "it would be good if", "be so kind as to",
+    "make their way", "make its way", "make your way", "the way to", "hi there", "hello there", "hey there", "hey team",
+    "hi team",
     "could you please", "would ROBOT mind", "mind sending", "mind flying", "mind driving", "mind going", "mind taking",
     "mind moving", "mind bringing", "mind getting", "mind having",
     "where it is", "where it stands", "where they are", "at the end", "in position", "has answered",
@@ -110,6 +114,12 @@ UNITS = _set(
 """Words behind a figure."""
 BY_THE_WAY = _set("via stopping calling passing")
 """Words between where a robot goes and what it passes before."""
+NOUNS_IN_ING = _set(
+    "building painting ceiling railing crossing clearing lighting awning bearing casing wiring piping flooring "
+    "scaffolding roofing glazing cladding coupling fitting opening housing mounting coating ring wing string king "
+    "drawing sling spring swing sting packing tubing ducting decking siding grating plumbing rigging landing parking"
+)
+"""Nouns that look like verbs."""
 DURATIONS = _set("second seconds sec secs minute minutes min mins hour hours hr hrs ms day days")
 """Units of time."""
 ASKING = _set("did does was were who where why has is are what which whose am")
@@ -129,7 +139,8 @@ IN_NO_NAME = _set(
 FIXTURES = _set(
     "stopcock tap switch breaker light lights lamp lamps door doors gate gates window windows lid hatch valve fan "
     "fans heater pump pumps machine alarm belt drawer cabinet shutter shutters power engine motor radio siren "
-    "beacon camera printer screen"
+    "beacon camera printer screen "
+    "toolbox locker cupboard container bin freezer fridge tailgate barrier turnstile roller blind blinds curtain flap"
 )
 """Things that are there on most sites, whether the map lists them or not."""
 NOUNS_TOO = _set(

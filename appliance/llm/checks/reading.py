@@ -306,10 +306,8 @@ def _group(
         text = " ".join(each.text for each in tokens[at:stop])
         return stop, Token(text, "robot", token.start, tokens[stop - 1].end, robots=which, group=group)
 
-    if token.text in _EVERYBODY:
-        return made(at + 1, everyone, "all")
-    if token.text in _SOMEBODY:
-        return made(at + 1, everyone, "any")
+    if token.text in _EVERYBODY | _SOMEBODY:
+        return made(at + 1, everyone, "all" if token.text in _EVERYBODY else "any")
     index = at
     lead = ""
     count: float | None = None
@@ -333,6 +331,9 @@ def _group(
     if noun in ("them", "us", "you") and lead in _GROUP and index > at:
         earlier = tuple(dict.fromkeys(r for each in before if each.group == "one" for r in each.robots))
         return made(index + 1, earlier or everyone, "all")
+    if kind in KINDS and noun != kind and (found := _listed(tokens, index + 1, kind, roster)):
+        stop, which = found
+        return made(stop, which, "all")
     numbered = index + 1 < len(tokens) and (tokens[index + 1].value is not None or tokens[index + 1].text in ("_", "-"))
     if kind in KINDS and not numbered:
         which = _of_kind(kind, roster)
@@ -347,6 +348,25 @@ def _group(
     if lead == "both" and index == at + 1 and len(everyone) == 2 and noun not in KINDS:
         return made(at + 1, everyone, "all")
     return at, None
+
+
+def _listed(
+    tokens: Sequence[Token], at: int, kind: str, roster: Sequence[_Robot]
+) -> tuple[int, tuple[str, ...]] | None:
+    """The robots of "rovers 1, 2 and 3", and the index behind them; None when there are fewer than two numbers."""
+    numbers: list[float] = []
+    index = stop = at
+    while index < len(tokens):
+        value = tokens[index].value
+        if value is not None and (not numbers or index > stop):
+            numbers.append(value)
+            stop = index + 1
+        elif not numbers or tokens[index].text not in (",", "and", "&", "plus"):
+            break
+        index += 1
+    names = {f"{kind}_{number:g}" for number in numbers} | {f"{kind}{number:g}" for number in numbers}
+    which = tuple(name for name, _ in roster if name in names)
+    return (stop, which) if len(numbers) > 1 and len(which) == len(numbers) else None
 
 
 def _meant(lead: str, count: float | None, *, plural: bool, number: int) -> str:

@@ -91,6 +91,24 @@ def _covered_by_named(facts: Facts, robot: str) -> bool:
     )
 
 
+def flies(facts: Facts) -> Iterable[Finding]:
+    """No robot is told to fly that does not fly."""
+    flying = {each.id: each.flies for each in facts.robots or ()}
+    tokens = facts.reading.tokens
+    for number, token in enumerate(tokens[1:], start=1):
+        before = tokens[number - 1]
+        if token.text in _FLY and before.kind == "robot" and any(not flying.get(each, True) for each in before.robots):
+            who = ", ".join(each for each in before.robots if not flying.get(each, True))
+            yield Finding(
+                check="capability", severity=Severity.HOLD, words=(token.text,),
+                message=f'"{token.text}": {who} does not fly',
+            )  # fmt: skip
+            return
+
+
+_FLY = frozenset(("fly", "flies", "flying", "hover", "hovers", "soar", "soars"))
+
+
 def idle_robot(facts: Facts) -> Iterable[Finding]:
     """Each robot that the words name has something to do."""
     if facts.continued:

@@ -161,7 +161,10 @@ def _scopes(facts: Facts) -> list[Scope]:
             continue
         behind = end
         inside = set(at)
-        asked = [each for group in options for each in group[:2] if set(each.at) <= inside and each.at[0] > number]
+        asked = [
+            each for group in options for each in group[:2]
+            if set(each.at) <= inside and each.at[0] > number and tokens[each.at[0] - 1].text not in _BEFORE_NOUNS
+        ]  # fmt: skip
         who = _who(facts, number, inside)
         broken = tuple(each.id for each in facts.plan.subtasks if _does(facts, each, asked, inside, who))
         alone = token.text in ("no", "nope") and number + 1 < len(tokens) and tokens[number + 1].kind == "mark"
@@ -177,6 +180,9 @@ def _scopes(facts: Facts) -> list[Scope]:
         )  # fmt: skip
     facts.__dict__["_scopes"] = found
     return found
+
+
+_BEFORE_NOUNS = frozenset(("a", "an", "any", "the", "no", "some"))
 
 
 def _who(facts: Facts, number: int, inside: set[int]) -> frozenset[str]:
@@ -465,6 +471,8 @@ def question(facts: Facts) -> Iterable[Finding]:
             or ({"possible", "about"} & set(words[:5]) and words[:1] in (["would"], ["how"]))
         ):
             continue
+        if _asked_of_robots(facts, inside):
+            continue
         subtasks = _of(facts, set(inside))
         past = set(words) & {"did", "was", "were", "had", "has", "have"}
         if (
@@ -486,6 +494,33 @@ def _courteous(words: Sequence[str]) -> bool:
     return len(body) > 1 and body[0] in ("could", "can", "would", "will") and body[1] in (
         "you", "somebody", "someone", "we", "i", "one",
     )  # fmt: skip
+
+
+_ABLE = frozenset(
+    ("reach", "make", "fit", "carry", "handle", "manage", "see", "hear", "be", "have", "know", "get", "lift")
+)
+"""Verbs behind "could the rover" that ask what it is able to do."""
+
+
+def _asked_of_robots(facts: Facts, inside: Sequence[int]) -> bool:
+    """Whether a sentence is "could rover_1 go to dock 1?": an order to robots, unless it asks what they are able to."""
+    tokens = facts.reading.tokens
+    body = [
+        n for n in inside if tokens[n].kind == "robot" or (tokens[n].text not in _OPENERS and tokens[n].kind == "word")
+    ]
+    if not body or tokens[body[0]].text not in ("could", "would"):
+        return False
+    rest = [n for n in body[1:] if tokens[n].text not in ("and", "please", "both", "kindly")]
+    who = [n for n in rest if tokens[n].kind == "robot"]
+    verbs = [n for n in rest if tokens[n].kind == "word"]
+    called = set[int]().union(*facts.account.called.values()) if facts.account.called else set[int]()
+    return bool(
+        who and verbs and rest[0] == who[0] and tokens[verbs[0]].text not in _ABLE
+        and (verbs[0] in called or tokens[verbs[0]].text in ("make", "be", "mind"))
+    )  # fmt: skip
+
+
+_OPENERS = frozenset(("hey", "hi", "hello", "ok", "okay", "so", "and", "then", "please", "there", "now"))
 
 
 def _perceives(facts: Facts, subtask: Subtask) -> bool:
@@ -567,40 +602,60 @@ def names(facts: Facts) -> Iterable[Finding]:
         if subtask.id in facts.added:
             continue
         for name, value in subtask.params.items():
-            if not isinstance(value, str):
-                continue
-            if name == "path":
-                if words := sorted(set(value.lower().split()) & _NOT_IN["path"]):
-                    yield _hold("names", f'{subtask.id}: "{words[0]}" is no place of a path', tuple(words))
-                continue
-            known = facts.site is not None and facts.site.find(value) is not None
-            if value.lower() in ("him", "her", "them", "it", "there") or (
-                not known and name not in FREE and value.lower() in _CHANGING
-            ):
-                yield _hold("names", f'{subtask.id}: {name} "{value}" names nobody and nothing', (value,))
-            if name in FREE:
-                last = re.findall(r"[\w']+|\.\.\.", value.lower())[-1:]
-                quoted = any(each.kind == "quote" for each in facts.reading.tokens)
-                if not quoted and last and (last[0] in lx.NEGATIONS or "..." in value):
-                    yield _hold("names", f'{subtask.id}: "{value}" takes something back at its end', (value,))
-                if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
-                    yield _hold("names", f"{subtask.id}: a robot cannot speak to the operator: notify does", ())
-                words = set(re.findall(r"[a-z]+", value.lower()))
-                if name == "event" and (words <= _NO_EVENT or value.lower().split()[-1] in lx.DURATIONS):
-                    yield _hold("names", f'{subtask.id}: "{value}" is nothing that happens', (value,))
-            elif name in _PLACES and not known and (shorter := _known_part(facts, value)):
-                yield _hold("names", f'{subtask.id}: {name} "{value}" is more than {shorter}', (value,))
-            elif (
-                not known
-                and coordinate(value) is None
-                and (set(value.lower().split()) & _NOT_IN.get(name, lx.IN_NO_NAME) or "," in value)
-            ):
-                yield _hold("names", f'{subtask.id}: {name} "{value}" is more than a name', (value,))
+            if isinstance(value, str):
+                wrong = _path if name == "path" else _free_text if name in FREE else _name
+                for text in wrong(facts, subtask, name, value):
+                    yield _hold("names", f"{subtask.id}: {text}", (value,))
     for subtask, name, value in facts.account.unsaid:
         if name not in FREE and subtask not in facts.added and value not in ("operator", "home"):
             yield _hold("names", f'{subtask}: no words say {name} "{value}"', (value,))
 
 
+def _path(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str]:
+    del subtask
+    if facts.site is not None and facts.site.find(value) is not None:
+        yield f'"{value}" is one place, and no path'
+    said = value.lower().split()
+    if "from" in said and "to" not in said:
+        yield f'the path "{value}" leads nowhere'
+    if words := sorted(set(said) & _NOT_IN[name]):
+        yield f'"{words[0]}" is no place of a path'
+
+
+def _free_text(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str]:
+    """What is wrong with a text to be spoken, or with what is waited for."""
+    last = re.findall(r"[\w']+|\.\.\.", value.lower())[-1:]
+    quoted = any(each.kind == "quote" for each in facts.reading.tokens)
+    if value.lower() in _NOBODY:
+        yield f'{name} "{value}" names nobody and nothing'
+    if not quoted and last and (last[0] in lx.NEGATIONS or "..." in value):
+        yield f'"{value}" takes something back at its end'
+    if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
+        yield "a robot cannot speak to the operator: notify does"
+    words = set(re.findall(r"[a-z]+", value.lower()))
+    if name == "event" and (words <= _NO_EVENT or set(value.lower().split()[-1:]) & lx.DURATIONS):
+        yield f'"{value}" is nothing that happens'
+
+
+def _name(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str]:
+    """What is wrong with a name of a thing, a place or a person."""
+    del subtask
+    low = value.lower()
+    if low in _NOBODY:
+        yield f'{name} "{value}" names nobody and nothing'
+    if (facts.site is not None and facts.site.find(value) is not None) or coordinate(value) is not None:
+        return
+    if low in _CHANGING or (name in _THINGS and re.fullmatch(r"[a-z]+ing", low) and low not in lx.NOUNS_IN_ING):
+        yield f'{name} "{value}" is no name'
+    if name in _PLACES and (shorter := _known_part(facts, value)):
+        yield f'{name} "{value}" is more than {shorter}'
+    elif set(low.split()) & _NOT_IN.get(name, lx.IN_NO_NAME) or "," in value:
+        yield f'{name} "{value}" is more than a name'
+
+
+_NOBODY = frozenset(("him", "her", "them", "it", "there"))
+_THINGS = frozenset(("target", "object", "asset"))
+"""Parameters that name a thing."""
 _PLACES = frozenset(("place", "area", "station", "at"))
 """Parameters that name a place."""
 
@@ -694,6 +749,8 @@ def coverage(facts: Facts) -> Iterable[Finding]:
             continue
         if token.kind == "number":
             continue
+        if token.text in ("could", "would") and number + 1 < len(tokens) and tokens[number + 1].kind == "robot":
+            continue  # `question` looks at these
         if token.kind == "word" and (token.text in special or token.text in lx.FILLERS):
             continue
         if token.kind == "word" and token.text in lx.RESULTS and _later(facts, number):
@@ -745,7 +802,7 @@ def polarity(facts: Facts) -> Iterable[Finding]:
     for claim in facts.account.unclaimed:
         if set(claim.at) <= kept or set(claim.at) & _free_values(facts):
             continue
-        if all(facts.reading.tokens[index].text in lx.FILLERS for index in claim.at):
+        if all(facts.reading.tokens[index].text in lx.FILLERS | {"up"} for index in claim.at):
             continue
         if facts.reading.tokens[claim.at[0]].text in lx.RESULTS and _later(facts, claim.at[0]):
             continue
@@ -832,7 +889,8 @@ def sequence(facts: Facts) -> Iterable[Finding]:
 
 def _as_said(facts: Facts) -> Iterable[Finding]:
     """Without words that say otherwise a robot goes about places in the order in which they are said."""
-    tokens, values = facts.reading.tokens, facts.account.values
+    tokens = facts.reading.tokens
+    values = {each: found or facts.account.called[each] for each, found in facts.account.values.items()}
     if _reordered(tokens):
         return
     by_the_way = next((n for n, each in enumerate(tokens) if each.text in lx.BY_THE_WAY), None)
@@ -905,7 +963,7 @@ def _reordered(tokens: Sequence[Token]) -> bool:
     return any(
         each.text in ("before", "once", "first", "when", "until", "from")
         or (each.text == "after" and follows not in ("that", "which", "this", "it", "wards"))
-        for each, follows in zip(tokens, behind, strict=True)
+        for each, follows in zip(tokens, behind, strict=False)
     )
 
 

@@ -469,3 +469,29 @@ def test_long_texts_take_linear_time(part: str) -> None:
     tenth = time.perf_counter() - began
     stop_request(text, roster)
     assert time.perf_counter() - began - tenth < max(1.0, 40 * tenth)
+
+
+@pytest.mark.parametrize(
+    ("text", "robots"),
+    [
+        ("oh god stop the rover theres a kid", ("rover_1",)),
+        ("stop there's a person", ()),
+        ("stop rover_1 it's going to hit him", ("rover_1",)),
+        ("stop everything someone fell", ()),
+        ("halt drone_1 because it smokes", ("drone_1",)),
+        ("stop the rover from crashing", ("rover_1",)),
+    ],
+)
+def test_a_stop_with_its_reason_behind_it_is_a_stop(text: str, robots: tuple[str, ...]) -> None:
+    """Who shouts gives the reason in the same breath, without a comma."""
+    stop = stop_request(text, ["rover_1", "drone_1"])
+    assert stop is not None
+    assert stop.robots == robots
+
+
+@pytest.mark.parametrize(
+    "text", ["stop something", "stop filming it", "stop people at the gate", "stop the rover from time to time"]
+)
+def test_what_follows_is_a_reason_only_behind_a_whole_stop(text: str) -> None:
+    """An object of the verb is none."""
+    assert stop_request(text, ["rover_1", "drone_1"]) is None
