@@ -13,6 +13,7 @@ Doors:
 Inside, from above to below: pool (the door), running (runs in progress), conversation (one run), keeper (tending:
 starts ahead, probes, replaces, gives up), planning (what the policies are shown, and what they mean here), books (who
 has which, who waits), policies (what to keep, give up and start), pressure (memory), starts (starts in progress,
-quarantine), starter (what a container is), container (its connections), link and engine (Podman), runner (what runs
-within). Of state volumes: volumes (whose state is the newest), ledger (which is here), folders (its files).
+quarantine), starter (what a container is), snapshots (the code that it mounts), container (its connections), link and
+engine (Podman), runner (what runs within). Of state volumes: volumes (whose state is the newest), ledger (which is
+here), folders (its files).
 """

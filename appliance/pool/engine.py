@@ -45,7 +45,10 @@ LABEL_GATEWAY = "swiftbot.gateway"
 LABEL_IMAGE = "swiftbot.image"
 LABEL_ID = "swiftbot.id"
 LABEL_STATE = "swiftbot.made"
-"""Hash of all that is fixed when a container is made: image, runner, handlers, size. Adopted only if it is the same."""
+"""Hash of all that is fixed when a container is made: image, snapshot, what the runner is told, bounds. Adopted only if
+it is the same, and if the runner has loaded just the code of that snapshot."""
+LABEL_SNAPSHOT = "swiftbot.snapshot"
+"""Digest of the snapshot of skills and runner that a container mounts (`snapshots`)."""
 LIMITING = frozenset({"memory", "pids", "cpu"})
 """cgroup controllers that must be delegated for limits to hold."""
 

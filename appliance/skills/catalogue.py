@@ -24,7 +24,7 @@ from msgspec import Meta, Struct, field
 from appliance.errors import ConfigError
 
 SKILLS = Path(__file__).resolve().parent
-"""The built-in skills; bind-mounted read-only at `/skills` in every container."""
+"""The built-in skills; a snapshot of them is mounted read-only at `/skills` in every container."""
 
 DOMAINS = (
     "navigation",

@@ -120,6 +120,7 @@ async def main():
     async def none(*_): return []
     pool = Pool(PoolConfig(floor={{"base": 2}}, capacity=2, mode="local"), gateway="g1", fleet={bench.fleet!r},
         run_dir=Path({str(bench.folder / "run" / bench.fleet / "g1")!r}),
+        data_dir=Path({str(bench.folder / "data" / bench.fleet / "g1")!r}),
         catalogue=load_catalogue([Path({str(bench.folder / "skills")!r})]),
         site=Site(), find_remote=none, on_call=none, on_change=lambda c: None)
     await pool.start()
