@@ -122,7 +122,7 @@ async def _container(handler: str, size_mb: int, count: int, image: str, config:
                 await starter.remove(container, engine)
     finally:
         engine.close()
-        await remove_fleet(fleet, url=config.podman_url)
+        await remove_fleet(fleet, volumes=True, url=config.podman_url)
 
 
 async def _measure(container: PooledContainer, image: str, count: int) -> dict[str, Any]:

@@ -6,7 +6,7 @@ Doors:
     selection            Algorithm 1 as plain functions; Candidate, Decision
     images               build and list the images that skills run in
     volumes, transfer    state volumes and images that move between gateways
-    engine.remove_fleet  remove a fleet's containers and volumes from this machine
+    engine.remove_fleet  remove a fleet's containers, and if asked its volumes, from this machine
     simulator.simulate   what the policies make of hours of arrivals, without a container
     settings.PoolConfig  section `[pool]` of a gateway's file
 
