@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import FLEET, HERE, Json, Where, show
+from appliance.cli.common import FLEET, HERE, Json, Skills, Where, show
 from appliance.errors import ConfigError, Exit
 
 
@@ -29,11 +29,6 @@ def _robots(text: str) -> dict[str, int]:
             raise ConfigError(f"--robots {text!r} is not understood", remedy="write mavlink=1,zenoh=1")
         found[kind] = int(number)
     return found
-
-
-Skills = Annotated[
-    tuple[Path, ...], Parameter(negative="", help="Folder with further skills and images; may be given more than once.")
-]
 
 
 def _order(where: Where, gateways: int, robots: str, site: str, rate: float, skills: tuple[Path, ...] = ()) -> Any:

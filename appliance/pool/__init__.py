@@ -4,7 +4,7 @@ Doors:
     pool.Pool            select, run, cancel, drain: what the task manager uses
     verbs.Verbs          warm, evict, release, hint, decisions: what operators and other gateways ask (`api`)
     selection            Algorithm 1 as plain functions; Candidate, Decision
-    images               build and list the images that skills run in
+    images               build and list the images that skills run in (`wheels`: their Python packages)
     volumes, transfer    state volumes and images that move between gateways
     engine.remove_fleet  remove a fleet's containers, and if asked its volumes, from this machine
     simulator.simulate   what the policies make of hours of arrivals, without a container

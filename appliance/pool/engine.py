@@ -33,7 +33,7 @@ from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 T = TypeVar("T")
 RUNTIME_DIRS = Path("/run/user")
 """Where systemd puts the runtime directories of users who are logged in or linger."""
-BUILD_REMEDY = "swiftbot images build"
+BUILD_REMEDY = "swiftbot images build, with --skills DIR for an image of your own"
 RUNC_REMEDY = (
     'crun wants cgroup v2: put runtime = "runc" under [engine] in ~/.config/containers/containers.conf of the'
     " service user and restart podman.socket"

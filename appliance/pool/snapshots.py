@@ -13,16 +13,15 @@ and an object whose bytes no longer have its digest is written again, so neither
 
 import hashlib
 import os
-import py_compile
 import secrets
 import shutil
-import sys
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from msgspec import Struct
 
 from appliance.errors import ConfigError
+from appliance.pool.bytecode import add_bytecode
 
 LEFT_OUT = frozenset({"__pycache__", ".git", ".hg", ".svn"})
 """Names that are no part of a skill wherever they are."""
@@ -93,7 +92,7 @@ class Snapshots:
             digest = hashlib.sha256(os.fsencode(listing)).hexdigest()
             folder = self._trees / digest
             if not self._same(folder, objects):
-                _compile(building)
+                add_bytecode(building)
                 if folder.exists():
                     folder.rename(self._trees / f"{_NEW}{secrets.token_hex(6)}")
                 building.rename(folder)
@@ -166,21 +165,6 @@ def _files(root: Path) -> Iterator[tuple[Path, str]]:
                 yield each, f"{path}{each.name}"
 
     return below(root, "", (root.resolve(),))
-
-
-def _compile(tree: Path) -> None:
-    """Add bytecode, which containers cannot write: it is used only while it is of the very source beside it."""
-    for file in tree.rglob("*.py"):
-        compiled = file.parent / "__pycache__" / f"{file.stem}.{sys.implementation.cache_tag}.pyc"
-        try:
-            py_compile.compile(
-                str(file),
-                str(compiled),
-                doraise=True,
-                invalidation_mode=py_compile.PycInvalidationMode.CHECKED_HASH,
-            )
-        except py_compile.PyCompileError:
-            continue  # the runner tells what is wrong with it
 
 
 def _remove(path: Path) -> None:
