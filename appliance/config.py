@@ -30,7 +30,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     fleet: str = "default"
     """Gateways, robots and clients of one fleet see each other; others on the same network do not."""
     data_dir: str = "/var/lib/swiftbot/data"
-    """SQLite file and artifacts."""
+    """SQLite file, artifacts, snapshots of skills."""
     run_dir: str = ""
     """Sockets into containers; empty: under XDG_RUNTIME_DIR. Short, since socket paths end at 108 bytes."""
     site: str = "warehouse"

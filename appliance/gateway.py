@@ -146,6 +146,7 @@ class Gateway:
             gateway=config.id,
             fleet=config.fleet,
             run_dir=self._run_dir(),
+            data_dir=self._data,
             catalogue=catalogue,
             site=site,
             find_remote=remote.find,

@@ -36,6 +36,7 @@ from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
 from appliance.record.settings import RecordConfig
 from appliance.robots.settings import MavlinkLink
+from appliance.skills.catalogue import load_catalogue
 
 Progress = Callable[[str], None]
 
@@ -66,6 +67,19 @@ class FleetState(Struct, frozen=True, kw_only=True):
         return Endpoint(fleet=self.fleet, connect=self.endpoints)
 
 
+class Ended(Struct, frozen=True, kw_only=True):
+    """What `down` has ended and removed, and which state volumes it has left."""
+
+    fleet: str
+    directory: str
+    processes: int
+    containers: int
+    removed_volumes: tuple[str, ...]
+    kept_volumes: tuple[str, ...]
+    problem: str = ""
+    """Why containers and volumes were left as they are; empty when Podman did all."""
+
+
 class Order(Struct, frozen=True, kw_only=True):
     """What to start."""
 
@@ -75,6 +89,8 @@ class Order(Struct, frozen=True, kw_only=True):
     mavlink: int = 1
     zenoh: int = 1
     site: str = "warehouse"
+    skills: tuple[Path, ...] = ()
+    """Folders with further skills, beside those that `base` names."""
     sim_rate: float = 1.0
     """How many times faster than real the simulated robots move."""
     pool: PoolConfig = PoolConfig()
@@ -122,13 +138,14 @@ async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> Fl
     """Start a fleet and wait until it can work.
 
     Raises:
-        ConfigError: one of that name runs already, or a name or number is wrong.
+        ConfigError: one of that name runs already, or a name, a number or a skill is wrong.
         PrerequisiteError: a process ended at once; the message has the end of its log.
         DeadlineError: it was not ready in time; the message says what was missing.
     """
     check_name(order.fleet, "fleet")
     if not 1 <= order.gateways <= 16:
         raise ConfigError(f"{order.gateways} gateways", remedy="a local fleet has 1 to 16")
+    load_catalogue(order.skills)  # so that a mistake in a manifest is told here, and not by each gateway's log
     directory = order.directory
     try:
         running = [each for each in read_state(directory).processes if alive(each)]
@@ -247,6 +264,7 @@ class _Starting:
             fleet=self._order.fleet,
             data_dir=str(self._order.directory / name / "data"),
             site=self._order.site,
+            skills=tuple(dict.fromkeys((*base.skills, *(str(each.resolve()) for each in self._order.skills)))),
             plane=PlaneConfig(
                 listen=(endpoints[index],),
                 peers=dict(zip(names, endpoints, strict=True)),
@@ -354,13 +372,28 @@ def _tail(path: Path, lines: int = 5) -> str:
         return "no log"
 
 
-async def down(directory: Path, *, progress: Progress, grace_s: float = 30.0) -> FleetState:
-    """End a fleet: its processes, gateways last, and its containers.
+async def down(
+    directory: Path, *, progress: Progress, volumes: bool = False, fleet: str = "", grace_s: float = 30.0
+) -> Ended:
+    """End a fleet: its processes, gateways last, and its containers; its state volumes stay unless told otherwise.
+
+    Args:
+        directory: where it was started.
+        progress: told what is being done.
+        volumes: remove its state volumes too, with all that skills keep in them.
+        fleet: whose state volumes to remove where none runs in the directory; those that are in use stay.
+        grace_s: from SIGTERM to SIGKILL.
 
     Raises:
-        NotFoundError: none was started there.
+        NotFoundError: none was started there, and there is no state volume to remove.
     """
-    state = read_state(directory)
+    try:
+        state = read_state(directory)
+    except NotFoundError:
+        left = await _remove(fleet, progress=progress, volumes=True, containers=False) if volumes and fleet else None
+        if left is None or not (left.removed_volumes or left.kept_volumes or left.problem):
+            raise
+        return msgspec.structs.replace(left, directory=str(directory))
     robots = [each for each in state.processes if each.name in state.robots]
     gateways = [each for each in state.processes if each.name in state.gateways]
     rest = [each for each in state.processes if each not in robots and each not in gateways]
@@ -368,22 +401,45 @@ async def down(directory: Path, *, progress: Progress, grace_s: float = 30.0) ->
         if group:
             progress(f"stopping {what}")
             await end(group, grace_s=grace_s)
-    await remove_containers(state.fleet, progress=progress)
+    ended = await _remove(state.fleet, progress=progress, volumes=volumes)
     (directory / "fleet.json").unlink(missing_ok=True)
-    return state
+    return msgspec.structs.replace(ended, directory=str(directory), processes=len(state.processes))
 
 
-async def remove_containers(fleet: str, *, progress: Progress) -> None:
-    """Remove the warm containers of a fleet; one that is not reachable is left and told."""
-    from appliance.pool.engine import remove_fleet  # noqa: PLC0415 - podman-py is slow to import
+async def remove_containers(fleet: str, *, progress: Progress, volumes: bool = False) -> None:
+    """Remove the warm containers of a fleet, and if asked its state volumes; what cannot be removed is told."""
+    await _remove(fleet, progress=progress, volumes=volumes)
 
+
+async def _remove(fleet: str, *, progress: Progress, volumes: bool, containers: bool = True) -> Ended:
+    from appliance.pool.engine import Removed, remove_fleet  # noqa: PLC0415 - podman-py is slow to import
+
+    removed, problem = Removed(), ""
     try:
-        removed = await remove_fleet(fleet)
+        removed = await remove_fleet(fleet, volumes=volumes, containers=containers)
     except SwiftbotError as error:
-        progress(f"containers were left: {error}")
-        return
-    if removed:
-        progress(f"removed {removed} containers")
+        problem = str(error)
+        progress(f"containers and state volumes were left: {error}")
+    if removed.containers:
+        progress(f"removed {counted(removed.containers, 'container')}")
+    if removed.volumes:
+        progress(f"removed {counted(len(removed.volumes), 'state volume')}")
+    if removed.kept_volumes:
+        progress(f"kept {counted(len(removed.kept_volumes), 'state volume')}")
+    return Ended(
+        fleet=fleet,
+        directory="",
+        processes=0,
+        containers=removed.containers,
+        removed_volumes=removed.volumes,
+        kept_volumes=removed.kept_volumes,
+        problem=problem,
+    )
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural where it is not one."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 async def end(processes: list[Process], *, grace_s: float) -> None:

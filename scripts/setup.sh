@@ -417,7 +417,7 @@ start_api() {
 # Built once for each content of the image definitions; looked for in Podman each time, since storage may be reset.
 build_images() {
   local want have
-  want=$(cd "$TREE" && find appliance/skills appliance/pool -type f \( -name '*.toml' -o -name 'Containerfile*' -o -name 'images.py' -o -name 'catalogue.py' \) -print0 | LC_ALL=C sort -z | xargs -0 sha256sum | sha256sum | cut -c1-64)
+  want=$(cd "$TREE" && find appliance/skills appliance/pool -type f \( -name '*.toml' -o -name 'Containerfile*' -o -name 'requirements.txt' -o -name 'images.py' -o -name 'wheels.py' -o -name 'catalogue.py' \) -print0 | LC_ALL=C sort -z | xargs -0 sha256sum | sha256sum | cut -c1-64)
   have=$(cat "$STATE/images" 2>/dev/null || true)
   if [ "$have" = "$want $(image_ids)" ]; then return; fi
   say "images: building what is missing"

@@ -46,7 +46,7 @@ async def running(
             async with FleetClient(state.endpoint) as client:
                 yield state, Orders(client, image)
         finally:
-            await local_fleet.down(order.directory, progress=progress)
+            await local_fleet.down(order.directory, progress=progress, volumes=True)
 
 
 class Orders:

@@ -110,7 +110,7 @@ async def fleet(
                 await client.gateway()
                 yield client
         finally:
-            await local_fleet.down(order.directory, progress=progress)
+            await local_fleet.down(order.directory, progress=progress, volumes=True)
 
 
 def task_of(task: str, skill: str, group: tuple[str, ...] = (), **params: Any) -> TaskRequest:

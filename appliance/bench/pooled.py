@@ -109,6 +109,7 @@ async def pool(
             gateway="bench",
             fleet=fleet_name(),
             run_dir=Path(folder) / "run",
+            data_dir=Path(folder) / "data",
             catalogue=load_catalogue([skills]),
             site=Site(),
             find_remote=nobody,

@@ -70,7 +70,7 @@ async def run(
                     taken["podman"].append(await _by_podman(fleet, name, storage))
                 link = transfers.link("there")
     finally:
-        await remove_fleet(fleet, url=podman_url)
+        await remove_fleet(fleet, volumes=True, url=podman_url)
     result: dict[str, Any] = {"megabytes": megabytes, "rounds": rounds}
     for way, samples in taken.items():
         median = statistics.median(samples)

@@ -10,6 +10,7 @@ import asyncio
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -104,11 +105,14 @@ async def _container(handler: str, size_mb: int, count: int, image: str, config:
                 gateway="bench",
                 fleet=fleet,
                 run_dir=Path(folder) / "run",
+                data_dir=Path(folder) / "data",
                 catalogue=load_catalogue([write_skill(Path(folder), image, handler=handler, more=more)]),
                 site={},
+                refused=Counter(),
                 on_death=lambda _: None,
                 state=ALONE,
             )
+            await starter.open()
             container = starter.new(image)
             facts: EngineFacts = await engine.facts()
             await starter.start(container, engine, facts)
@@ -118,7 +122,7 @@ async def _container(handler: str, size_mb: int, count: int, image: str, config:
                 await starter.remove(container, engine)
     finally:
         engine.close()
-        await remove_fleet(fleet, url=config.podman_url)
+        await remove_fleet(fleet, volumes=True, url=config.podman_url)
 
 
 async def _measure(container: PooledContainer, image: str, count: int) -> dict[str, Any]:

@@ -18,6 +18,10 @@ TOOLS = Group("Logs, images, checks", sort_key=4)
 
 Json = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 
+Skills = Annotated[
+    tuple[Path, ...], Parameter(negative="", help="Folder with further skills and images; may be given more than once.")
+]
+
 Why = Annotated[str, Parameter(help="Why, for the audit and for those who wonder.")]
 
 

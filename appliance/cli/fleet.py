@@ -2,12 +2,13 @@
 
 import asyncio
 import signal
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import FLEET, HERE, Where
+from appliance.cli.common import FLEET, HERE, Json, Skills, Where, show
 from appliance.errors import ConfigError, Exit
 
 
@@ -30,7 +31,7 @@ def _robots(text: str) -> dict[str, int]:
     return found
 
 
-def _order(where: Where, gateways: int, robots: str, site: str, rate: float) -> Any:
+def _order(where: Where, gateways: int, robots: str, site: str, rate: float, skills: tuple[Path, ...] = ()) -> Any:
     from appliance.local_fleet import Order
 
     numbers = _robots(robots)
@@ -42,6 +43,7 @@ def _order(where: Where, gateways: int, robots: str, site: str, rate: float) -> 
         zenoh=numbers["zenoh"],
         site=site,
         sim_rate=rate,
+        skills=skills,
     )
 
 
@@ -50,6 +52,7 @@ def up(
     gateways: int = 3,
     robots: str = "mavlink=1,zenoh=1",
     site: str = "warehouse",
+    skills: Skills = (),
     rate: float = 1.0,
     detach: Annotated[bool, Parameter(negative="")] = False,
     where: Where = HERE,
@@ -60,6 +63,7 @@ def up(
         gateways: How many gateways.
         robots: How many simulated robots of each kind.
         site: Built-in site or site file.
+        skills: Folder with further skills and images.
         rate: How many times faster than real the simulated robots move.
         detach: Return when the fleet is ready; end it with `swiftbot down`.
         where: The fleet.
@@ -67,7 +71,7 @@ def up(
     from appliance import local_fleet
 
     async def go() -> None:
-        order = _order(where, gateways, robots, site, rate)
+        order = _order(where, gateways, robots, site, rate, skills)
         state = await local_fleet.up(order, progress=console.err.print)
         console.out.print(f"fleet {state.fleet} is up: {', '.join(state.gateways)}; robots {', '.join(state.robots)}")
         if detach:
@@ -83,13 +87,43 @@ def up(
     return 0
 
 
-def down(*, where: Where = HERE) -> int:
-    """End a local fleet and remove its containers."""
+def down(
+    *,
+    volumes: Annotated[bool, Parameter(negative="", help="Remove its state volumes too.")] = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """End a local fleet and remove its containers; state volumes stay for the next `swiftbot up`.
+
+    Args:
+        volumes: Remove its state volumes too.
+        as_json: Print JSON: processes, containers, removed and kept volumes.
+        where: The fleet.
+    """
     from appliance import local_fleet
 
-    asyncio.run(local_fleet.down(where.folder(), progress=console.err.print))
-    console.out.print(f"fleet {where.fleet} is down")
+    ended = asyncio.run(
+        local_fleet.down(where.folder(), progress=console.err.print, volumes=volumes, fleet=where.fleet)
+    )
+    show(ended, as_json=as_json, table=_ended(ended, where, volumes=volumes))
     return 0
+
+
+def _ended(ended: Any, where: Where, *, volumes: bool) -> str:
+    """Return what `down` did as one line, with the command that removes what it kept."""
+    from appliance.local_fleet import counted
+
+    if ended.problem:
+        return f"fleet {ended.fleet} is down; its containers and state volumes were left: {ended.problem}"
+    parts = [f"removed {counted(ended.containers, 'container')}"]
+    if ended.removed_volumes:
+        parts.append(f"removed {counted(len(ended.removed_volumes), 'state volume')}")
+    if ended.kept_volumes:
+        options = "" if where.fleet == HERE.fleet else f" --fleet {where.fleet}"
+        options += "" if where.directory is None else f" --dir {where.directory}"
+        reason = "in use" if volumes else f"remove with: swiftbot down --volumes{options}"
+        parts.append(f"kept {counted(len(ended.kept_volumes), 'state volume')} ({reason})")
+    return f"fleet {ended.fleet} is down: {', '.join(parts)}"
 
 
 def demo(

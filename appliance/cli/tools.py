@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from appliance import console
-from appliance.cli.common import HERE, TOOLS, Json, Where, Why, show
+from appliance.cli.common import HERE, TOOLS, Json, Skills, Where, Why, show
 from appliance.errors import Exit
 
 images_app = App(name="images", help="Images that skills run in.", group=TOOLS)
@@ -20,22 +20,41 @@ def add_to(app: App) -> None:
 
 
 @images_app.command(name="build")
-def images_build(names: tuple[str, ...] = (), *, force: Annotated[bool, Parameter(negative="")] = False) -> int:
-    """Build the images that skills run in, from Debian packages; those that are there already are kept.
+def images_build(
+    names: tuple[str, ...] = (),
+    *,
+    skills: Skills = (),
+    wheelhouse: Annotated[
+        tuple[Path, ...],
+        Parameter(negative="", help="Folder of wheels for requirements.txt; before wheelhouse/ beside it."),
+    ] = (),
+    force: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Json = False,
+) -> int:
+    """Build the images that skills run in, from Debian packages and wheels; those that are there already are kept.
 
     Args:
         names: Which; all when none is given.
+        skills: Folder with further skills and images.
+        wheelhouse: Folder of wheels.
         force: Build even if present.
+        as_json: Print JSON: the reference of each image by its name.
     """
     from appliance.pool.images import build
     from appliance.skills.catalogue import load_catalogue
 
-    catalogue = load_catalogue()
+    catalogue = load_catalogue(skills)
 
     async def go() -> None:
+        built: dict[str, str] = {}
         for name in names or tuple(catalogue.images):
-            reference = await build(name, catalogue, progress=console.err.print, force=force)
-            console.out.print(reference)
+            built[name] = await build(
+                name, catalogue, progress=console.err.print, force=force, wheelhouses=tuple(wheelhouse)
+            )
+            if not as_json:
+                console.out.print(built[name])
+        if as_json:
+            show(built, as_json=True)
 
     asyncio.run(go())
     return 0
@@ -43,11 +62,16 @@ def images_build(names: tuple[str, ...] = (), *, force: Annotated[bool, Paramete
 
 @images_app.command(name="list")
 def images_list(
-    *, gateways: Annotated[bool, Parameter(negative="")] = False, as_json: Json = False, where: Where = HERE
+    *,
+    skills: Skills = (),
+    gateways: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Json = False,
+    where: Where = HERE,
 ) -> int:
     """List the images of the catalogue and whether they are built.
 
     Args:
+        skills: Folder with further skills and images.
         gateways: Ask a fleet which of its gateways have each.
         as_json: Print JSON.
         where: The fleet, if it is asked.
@@ -59,7 +83,7 @@ def images_list(
     from appliance.skills.catalogue import load_catalogue
 
     async def go() -> None:
-        found = await list_images(load_catalogue())
+        found = await list_images(load_catalogue(skills))
         if gateways:
             async with FleetClient(where.endpoint()) as client:
                 await client.gateway()
@@ -75,6 +99,7 @@ def images_fetch(
     name: str,
     *,
     source: Annotated[str, Parameter(name="--from", help="Gateway to ask first; any that has it otherwise.")] = "",
+    skills: Skills = (),
     gateway: Annotated[str, Parameter(help="Gateway that fetches it; the one that is linked to otherwise.")] = "",
     why: Why = "",
     as_json: Json = False,
@@ -85,6 +110,7 @@ def images_fetch(
     Args:
         name: An image of the catalogue, such as base, or a full reference.
         source: Gateway to ask first.
+        skills: Folder with further skills and images.
         gateway: Gateway that fetches it.
         why: Why, for the audit.
         as_json: Print JSON.
@@ -95,7 +121,7 @@ def images_fetch(
     from appliance.pool.settings import PoolConfig
     from appliance.skills.catalogue import load_catalogue
 
-    spec = load_catalogue().images.get(name)
+    spec = load_catalogue(skills).images.get(name)
     full = name if spec is None else reference(spec, PoolConfig())
 
     async def go() -> None:

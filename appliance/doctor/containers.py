@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from appliance.doctor.check import SETUP, Check
 from appliance.errors import SwiftbotError
 from appliance.pool.engine import LIMITING, ContainerSpec, Engine, EngineFacts
-from appliance.pool.images import reference
+from appliance.pool.images import build_command, reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue
 
@@ -54,7 +54,7 @@ async def check_images(engine: Engine, catalogue: Catalogue, config: PoolConfig)
                 name=f"image {name}",
                 ok=found,
                 detail=full if found else f"{full} is not there",
-                remedy="swiftbot images build",
+                remedy=build_command(spec),
             )
         )
     return checks, usable

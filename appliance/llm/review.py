@@ -89,8 +89,8 @@ def review(facts: Facts) -> Review:
 
 
 ACCOUNTED = 0.55
-"""What a plan that accounts for every word is sure of beside its planner: of the cases of `swiftbot bench intent` 201 of
-207 such plans were right whose planner was 0.1 to 0.6 sure, 808 of 809 of those above, and 9 of 14 of those below."""
+"""What a plan that accounts for every word is sure of beside its planner: of the cases of `swiftbot bench intent` 201
+of 207 such plans were right whose planner was 0.1 to 0.6 sure, 808 of 809 above that, and 9 of 14 below it."""
 
 
 def _accounted(facts: Facts, found: Sequence[Finding]) -> float:

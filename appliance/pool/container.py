@@ -220,6 +220,15 @@ class PooledContainer:
         self.first_rss_mb = self.first_rss_mb or self.rss_mb
         return reply
 
+    async def hello(self, *, timeout_s: float) -> dict[str, str]:
+        """Ask what code the runner has loaded: SHA-256 digests by `ROOT/path`; empty when it cannot tell.
+
+        Raises:
+            DeadlineError, UnreachableError: it does not answer.
+        """
+        code: Any = (await self._ask({"op": "hello"}, timeout_s)).get("code")
+        return {str(path): str(digest) for path, digest in code.items()} if isinstance(code, dict) else {}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+
     async def cancel(self, run_id: str, *, reason: str, grace_s: float) -> bool:
         """Ask the runner to end a run; False when it has none of that id."""
         reply = await self._ask(

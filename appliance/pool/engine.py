@@ -18,7 +18,7 @@ import os
 import socket
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
@@ -33,7 +33,7 @@ from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 T = TypeVar("T")
 RUNTIME_DIRS = Path("/run/user")
 """Where systemd puts the runtime directories of users who are logged in or linger."""
-BUILD_REMEDY = "swiftbot images build"
+BUILD_REMEDY = "swiftbot images build, with --skills DIR for an image of your own"
 RUNC_REMEDY = (
     'crun wants cgroup v2: put runtime = "runc" under [engine] in ~/.config/containers/containers.conf of the'
     " service user and restart podman.socket"
@@ -45,7 +45,10 @@ LABEL_GATEWAY = "swiftbot.gateway"
 LABEL_IMAGE = "swiftbot.image"
 LABEL_ID = "swiftbot.id"
 LABEL_STATE = "swiftbot.made"
-"""Hash of all that is fixed when a container is made: image, runner, handlers, size. Adopted only if it is the same."""
+"""Hash of all that is fixed when a container is made: image, snapshot, what the runner is told, bounds. Adopted only if
+it is the same, and if the runner has loaded just the code of that snapshot."""
+LABEL_SNAPSHOT = "swiftbot.snapshot"
+"""Digest of the snapshot of skills and runner that a container mounts (`snapshots`)."""
 LIMITING = frozenset({"memory", "pids", "cpu"})
 """cgroup controllers that must be delegated for limits to hold."""
 
@@ -357,17 +360,32 @@ class PodmanEngine:
             if "already exists" not in error.message:  # another start of this pool made it just now
                 raise
 
-    async def remove_volumes(self, labels: Mapping[str, str]) -> None:
-        """Remove the named volumes that have all these labels and that no container uses."""
+    async def volume_names(self, labels: Mapping[str, str]) -> tuple[str, ...]:
+        """Return the names of the volumes that have all these labels, sorted."""
         wanted = _filters(labels)
 
-        def work(client: Any) -> None:
+        def work(client: Any) -> tuple[str, ...]:
             response = client.api.get("/volumes/json", params={"filters": wanted})
             response.raise_for_status()
-            for each in response.json() or ():
-                client.api.delete(f"/volumes/{each['Name']}")
+            return tuple(sorted(str(each["Name"]) for each in response.json() or ()))
 
-        await self._ask("remove volumes", work)
+        return await self._ask("list volumes", work)
+
+    async def remove_unused_volumes(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Remove named volumes but those that a container uses; returns which of them are gone."""
+
+        def work(client: Any) -> tuple[str, ...]:
+            gone: list[str] = []
+            for name in names:
+                response = client.api.delete(f"/volumes/{name}")
+                if response.status_code == requests.codes.conflict:
+                    continue  # in use
+                if response.status_code != requests.codes.not_found:
+                    response.raise_for_status()
+                gone.append(name)
+            return tuple(gone)
+
+        return await self._ask("remove volumes", work)
 
     def close(self) -> None:
         """Let go of threads and connections; a call in progress is waited for."""
@@ -381,20 +399,38 @@ def _filters(labels: Mapping[str, str]) -> str:
     return json.dumps({"label": [f"{key}={value}" for key, value in labels.items()]})
 
 
-async def remove_fleet(fleet: str, *, url: str = "") -> int:
-    """Remove all containers and volumes of one fleet on this machine; returns how many containers.
+class Removed(Struct, frozen=True, kw_only=True):
+    """What was removed of a fleet on this machine, and which of its state volumes are there still."""
+
+    containers: int = 0
+    volumes: tuple[str, ...] = ()
+    kept_volumes: tuple[str, ...] = ()
+
+
+async def remove_fleet(fleet: str, *, volumes: bool, containers: bool = True, url: str = "") -> Removed:
+    """Remove what one fleet has on this machine.
+
+    Args:
+        fleet: its name.
+        volumes: remove its state volumes too, but for those that a container uses; they hold what its skills keep.
+        containers: remove its containers.
+        url: Podman's API socket.
 
     Raises:
         UnreachableError: Podman does not answer.
+        PoolError: Podman will not.
     """
     engine = PodmanEngine(url)
+    labels = {LABEL_FLEET: fleet}
     try:
-        found = await engine.containers({LABEL_FLEET: fleet})
+        found = await engine.containers(labels) if containers else []
         await asyncio.gather(*(engine.remove(each.id) for each in found))
-        await engine.remove_volumes({LABEL_FLEET: fleet})
+        names = await engine.volume_names(labels)
+        gone = await engine.remove_unused_volumes(names) if volumes and names else ()
     finally:
         engine.close()
-    return len(found)
+    kept = tuple(name for name in names if name not in gone)
+    return Removed(containers=len(found), volumes=gone, kept_volumes=kept)
 
 
 def create_arguments(spec: ContainerSpec) -> dict[str, Any]:

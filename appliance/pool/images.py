@@ -2,7 +2,8 @@
 
 It exists because a gateway often has no image registry in reach: the root filesystem is made of the host's own
 Debian packages by `mmdebstrap` in a user namespace (no root needed) and imported through the Podman API. Where a
-base image is configured, the image's Containerfile is built on it instead. An image's tag is a hash of all that
+base image is configured, the image's Containerfile is built on it instead. Python packages that its
+`requirements.txt` pins are laid over either from a folder of wheels (`wheels`). An image's tag is a hash of all that
 goes into it, so building again is a look at the list.
 """
 
@@ -21,10 +22,13 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import NotFoundError, PrerequisiteError
+from appliance.pool import wheels
 from appliance.pool.engine import PodmanEngine
 from appliance.pool.settings import PoolConfig
 from appliance.pool.sources import host_sources
-from appliance.skills.catalogue import SKILLS, Catalogue, ImageSpec, image_reference
+from appliance.pool.wheels import Python
+from appliance.skills.catalogue import SKILLS, WHEELHOUSE, Catalogue, ImageSpec, image_reference
+from appliance.skills.requirements import FILE, Requirement, read_requirements
 
 log = structlog.get_logger(__name__)
 
@@ -58,6 +62,12 @@ def reference(spec: ImageSpec, config: PoolConfig) -> str:
         return name
     repository, _, tag = name.rpartition(":")
     return f"{repository}:{hashlib.sha256(f'{tag} on {base}'.encode()).hexdigest()[:12]}"
+
+
+def build_command(spec: ImageSpec) -> str:
+    """Return the command that builds an image, with the folder of skills that it is in unless it is built in."""
+    root = spec.folder.parent.parent
+    return "swiftbot images build" if root == SKILLS else f"swiftbot images build {spec.name} --skills {root}"
 
 
 def _spec(name: str, catalogue: Catalogue) -> ImageSpec:
@@ -101,6 +111,7 @@ async def build(
     *,
     progress: Progress = _ignore,
     force: bool = False,
+    wheelhouses: Sequence[Path] = (),
 ) -> str:
     """Build one image unless it is there; returns its reference.
 
@@ -110,10 +121,13 @@ async def build(
         config: names Podman's socket and, perhaps, a base image.
         progress: called with each line of the build's log.
         force: build it again even so.
+        wheelhouses: folders of wheels for its `requirements.txt`, looked at before `wheelhouse/` beside that file.
 
     Raises:
         NotFoundError: no such image.
-        PrerequisiteError: it cannot be built; the message ends with the end of the log.
+        ConfigError: its `requirements.txt` is wrong, or a wheelhouse cannot be read.
+        PrerequisiteError: it cannot be built; the message ends with the end of the log. Or a wheel is missing, or
+            is none of those that are pinned.
         UnreachableError: Podman does not answer.
     """
     config = config or PoolConfig()
@@ -126,11 +140,12 @@ async def build(
             progress(f"{full} is there")
             return full
         progress(f"building {full}")
+        needed = await asyncio.to_thread(_needed, spec, wheelhouses)
         base = base_image(config)
         if base:
-            await _from_registry(spec, full, base, progress)
+            await _from_registry(spec, full, base, needed, progress)
         else:
-            await _from_packages(spec, full, engine, progress)
+            await _from_packages(spec, full, engine, needed, progress)
         sizes = await _sizes(engine)
     finally:
         engine.close()
@@ -138,6 +153,29 @@ async def build(
         raise PrerequisiteError(f"{full} was built but is not there", remedy="see what removes images of this user")
     progress(f"{full}: {sizes[full] / 2**20:.0f} MiB in {time.monotonic() - begun:.0f} s")
     return full
+
+
+class _Needed(Struct, frozen=True):
+    """The Python packages of an image, and where their wheels are."""
+
+    file: Path
+    requirements: tuple[Requirement, ...] = ()
+    folders: tuple[Path, ...] = ()
+
+    def unpack(self, root: Path, python: Python, progress: Progress) -> None:
+        """Unpack them into a folder that is laid over the image's root filesystem; see `wheels.unpack`."""
+        wheels.unpack(self.requirements, self.folders, root, python, file=self.file, progress=progress)
+
+
+def _needed(spec: ImageSpec, wheelhouses: Sequence[Path]) -> _Needed:
+    """Return the Python packages of an image, checked as far as can be before there is a Python to check for."""
+    file, beside = spec.folder / FILE, spec.folder / WHEELHOUSE
+    if not file.is_file():
+        return _Needed(file)
+    folders = (*wheelhouses, *((beside,) if beside.is_dir() else ()))
+    requirements = read_requirements(file)
+    wheels.check(requirements, folders, file=file)
+    return _Needed(file, requirements, folders)
 
 
 async def _run(what: str, command: Sequence[str], progress: Progress, *, remedy: str) -> None:
@@ -175,19 +213,53 @@ async def _run(what: str, command: Sequence[str], progress: Progress, *, remedy:
         raise PrerequisiteError(f"{what} failed with status {status}; the end of its log:\n{text}\n", remedy=remedy)
 
 
-async def _from_registry(spec: ImageSpec, full: str, base: str, progress: Progress) -> None:
+async def _from_registry(spec: ImageSpec, full: str, base: str, needed: _Needed, progress: Progress) -> None:
     file = spec.folder / "Containerfile"
     if not file.is_file():
         raise PrerequisiteError(
             f"{file} is missing, so {spec.name} cannot be built on {base}", remedy="write it with ARG BASE"
         )
+    # What has not all that it should have gets another name, or it would pass for the image.
+    built = f"{full}-without-wheels" if needed.requirements else full
     arguments = ("--build-arg", f"BASE={base}", "--build-arg", f"PACKAGES={' '.join(spec.packages)}")
-    command = ("podman", "build", "--tag", full, *arguments, "--file", str(file), str(spec.folder))
+    command = ("podman", "build", "--tag", built, *arguments, "--file", str(file), str(spec.folder))
     remedy = f"check that {base} can be pulled and that its packages include {', '.join(spec.packages)}"
     await _run(f"building {spec.name} on {base}", command, progress, remedy=remedy)
+    if needed.requirements:
+        await _lay_over(built, full, needed, progress)
 
 
-async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, progress: Progress) -> None:
+async def _lay_over(built: str, full: str, needed: _Needed, progress: Progress) -> None:
+    """Make an image of one that was built and of what its wheels hold."""
+    python = await _python_in(built)
+    with tempfile.TemporaryDirectory(prefix="swiftbot-image-") as folder:
+        root = Path(folder) / "root"
+        root.mkdir()
+        await asyncio.to_thread(needed.unpack, root, python, progress)
+        file = Path(folder) / "Containerfile"
+        file.write_text(f"FROM {built}\nCOPY root/ /\n", encoding="utf-8")
+        command = ("podman", "build", "--pull=never", "--tag", full, "--file", str(file), folder)
+        await _run(f"adding wheels to {full}", command, progress, remedy="see what the log says")
+    await _run(f"forgetting {built}", ("podman", "untag", built), _ignore, remedy=f"podman untag {built}")
+
+
+async def _python_in(built: str) -> Python:
+    """Ask an image's own Python for its version and where it looks for packages."""
+    program = "import sys, sysconfig; print('python', sys.version_info[1], sysconfig.get_path('purelib'))"
+    lines: list[str] = []
+    command = ("podman", "run", "--rm", "--network=none", "--pull=never", "--entrypoint=python3", built, "-c", program)
+    remedy = "its Containerfile must install python3"
+    await _run(f"asking {built} for its Python", command, lines.append, remedy=remedy)
+    for line in lines:
+        match line.split():
+            case ["python", minor, site] if minor.isdecimal():
+                return Python(minor=int(minor), site=site)
+            case _:
+                continue
+    raise PrerequisiteError(f"{built} does not tell its Python: {lines[-1:]}", remedy=remedy)
+
+
+async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, needed: _Needed, progress: Progress) -> None:
     recipe = tomllib.loads(RECIPE.read_text(encoding="utf-8"))
     release, sources = await asyncio.to_thread(host_sources)
     with tempfile.TemporaryDirectory(prefix="swiftbot-image-") as folder:
@@ -211,6 +283,12 @@ async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, progr
             " answer, and that the user has a range in /etc/subuid and /etc/subgid"
         )
         await _run(f"building {spec.name} from Debian packages", command, progress, remedy=remedy)
+        if needed.requirements:
+            root = Path(folder) / "root"
+            root.mkdir()
+            python = await asyncio.to_thread(wheels.python_of, archive)
+            await asyncio.to_thread(needed.unpack, root, python, progress)
+            await asyncio.to_thread(wheels.append, archive, root)
         progress(f"importing {archive.stat().st_size / 2**20:.0f} MB")
         await engine.import_image(archive, full)
 

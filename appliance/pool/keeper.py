@@ -133,7 +133,12 @@ class Keeper:
     # --- life -----------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Connect to Podman and adopt what is there; whatever is missing then is worked on in the background."""
+        """Connect to Podman and adopt what is there; whatever is missing then is worked on in the background.
+
+        Raises:
+            ConfigError: the skills cannot be copied for containers to mount.
+        """
+        await self._starter.open()
         await self.link.start(CONNECT_WAIT_S)
         for work in (self._tend_forever(), self.planning.memory.run()):
             self._standing.append(asyncio.create_task(work, name=work.__qualname__))
@@ -339,12 +344,14 @@ class Keeper:
         if engine is None:
             return
         try:
-            for found in await self._starter.own(engine):
+            own = await self._starter.own(engine)
+            for found in own:
                 if self._stopped or self.draining:
                     return  # what is kept is the next gateway's, which may be here already
                 if self.books.get(found.labels.get(LABEL_ID, "")) is None:
                     log.info("stray container removed", container=found.name)
                     await engine.remove(found.id)
+            await self._starter.forget_snapshots(own)
         except UnreachableError as error:
             self.link.lost(error)
         except SwiftbotError as error:

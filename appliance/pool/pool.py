@@ -53,6 +53,7 @@ class Pool:
         gateway: this gateway's id.
         fleet: its fleet; containers of other fleets and gateways are never touched.
         run_dir: folder for the containers' sockets.
+        data_dir: folder of this gateway's state; the snapshots of skills that containers mount are in it.
         catalogue: skills and images.
         site: the map that handlers get.
         find_remote: offers of other gateways for a need; told too whose will not be used.
@@ -76,6 +77,7 @@ class Pool:
         gateway: str,
         fleet: str,
         run_dir: Path,
+        data_dir: Path,
         catalogue: Catalogue,
         site: Site,
         find_remote: Callable[[Need, Collection[str]], Awaitable[list[Candidate]]],
@@ -106,8 +108,10 @@ class Pool:
                 gateway=gateway,
                 fleet=fleet,
                 run_dir=run_dir,
+                data_dir=data_dir,
                 catalogue=catalogue,
                 site=msgspec.to_builtins(site),
+                refused=self.refused,
                 on_death=on_death,
                 state=state,
             )
@@ -173,7 +177,11 @@ class Pool:
     # --- life -----------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Connect to Podman, adopt this gateway's containers, and warm up to the floor in the background."""
+        """Connect to Podman, adopt this gateway's containers, and warm up to the floor in the background.
+
+        Raises:
+            ConfigError: the skills cannot be copied for containers to mount.
+        """
         await self._keepsake.start()
         await self._keeper.start()
 

@@ -11,7 +11,8 @@ import json
 import secrets
 import shutil
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from appliance.pool.engine import (
     LABEL_GATEWAY,
     LABEL_ID,
     LABEL_IMAGE,
+    LABEL_SNAPSHOT,
     LABEL_STATE,
     ContainerSpec,
     Engine,
@@ -36,6 +38,7 @@ from appliance.pool.engine import (
     Found,
 )
 from appliance.pool.settings import PoolConfig
+from appliance.pool.snapshots import Snapshot, Snapshots, unexpected
 from appliance.pool.state import State
 from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
 
@@ -59,7 +62,11 @@ class Size(Struct, frozen=True, kw_only=True):
 
 
 class Starter:
-    """Makes containers for one gateway of one fleet, and takes over those it finds."""
+    """Makes containers for one gateway of one fleet, and takes over those it finds.
+
+    `open` comes first. Containers mount a snapshot of the skills and the runner, never the live folders, and each is
+    asked what it has loaded: one that has loaded anything else is not used, and `refused["loaded code"]` counts it.
+    """
 
     def __init__(
         self,
@@ -68,8 +75,10 @@ class Starter:
         gateway: str,
         fleet: str,
         run_dir: Path,
+        data_dir: Path,
         catalogue: Catalogue,
         site: dict[str, Any],
+        refused: Counter[str],
         on_death: Callable[[PooledContainer], None],
         state: State,
     ) -> None:
@@ -85,7 +94,20 @@ class Starter:
         self._preloads_mb: dict[str, int] = {}
         self._on_death = on_death
         self._labels = {LABEL_FLEET: fleet, LABEL_GATEWAY: gateway}
-        self._code = code_digest(catalogue) + hashlib.sha256(json.dumps(site, sort_keys=True).encode()).hexdigest()
+        self._refused = refused
+        self._snapshots = Snapshots(data_dir / "snapshots")
+        self._taken: Snapshot | None = None
+        self._roots = _roots(catalogue)
+
+    async def open(self) -> None:
+        """Take the snapshot that all containers mount from now on; ConfigError when that cannot be done."""
+        self._taken = await asyncio.to_thread(self._snapshots.take, self._roots)
+
+    @property
+    def _snapshot(self) -> Snapshot:
+        if self._taken is None:
+            raise PoolError("no snapshot of the skills has been taken")
+        return self._taken
 
     def skills(self, image: str) -> list[SkillManifest]:
         """Return the skills that a container of an image can run: its own and those of compatible images."""
@@ -153,7 +175,8 @@ class Starter:
         """
         began = time.monotonic()
         spec = self._spec(container, facts)
-        runner = self._runner_spec(container.info)
+        image = container.info.image
+        runner = {**self._told(image), "proven": self._made(image) in self._proven}
         await asyncio.to_thread(_write, container.folder, runner)
 
         async def alive() -> None:
@@ -168,6 +191,7 @@ class Starter:
             await engine.start(container.engine_id)
 
             await container.connect(timeout_s=self._config.start_timeout_s, alive=alive)
+            await self._check_code(container, timeout_s=self._config.start_timeout_s)
         except BaseException as error:
             text = await engine.logs(container.engine_id) if container.engine_id else ""
             await self._discard(container, engine)
@@ -180,6 +204,18 @@ class Starter:
             self._proven.add(self._made(container.info.image))
         for what, problem in container.problems.items():
             log.warning("not preloaded", container=container.id, image=container.info.image, what=what, reason=problem)
+
+    async def _check_code(self, container: PooledContainer, *, timeout_s: float) -> None:
+        """Ask a container what it has loaded; PoolError, counted, when that is not the code of the snapshot."""
+        loaded = await container.hello(timeout_s=timeout_s)
+        wrong = unexpected(loaded, self._snapshot.files)
+        if loaded and not wrong:
+            return
+        self._refused["loaded code"] += 1
+        log.warning("container has loaded other code", container=container.id, image=container.info.image, files=wrong)
+        names = ", ".join(wrong[:3]) + (f" and {len(wrong) - 3} others" if len(wrong) > 3 else "")
+        what = f"has loaded other code than snapshot {self._snapshot.digest[:12]} holds: {names}"
+        raise PoolError(f"container {container.id} {what if wrong else 'does not say what code it has loaded'}")
 
     async def _create(self, spec: ContainerSpec, engine: Engine) -> str:
         """Create the container; an image that is not there is asked of the other gateways first."""
@@ -219,7 +255,17 @@ class Starter:
         found = await engine.containers(self._labels)
         adopted = [each for each in await asyncio.gather(*(self._adopt(each, engine) for each in found)) if each]
         await asyncio.to_thread(self._forget_folders, {each.id for each in adopted})
+        await self.forget_snapshots(await self.own(engine))
         return adopted
+
+    async def forget_snapshots(self, found: Iterable[Found]) -> None:
+        """Remove the snapshots that none of these containers of this gateway mounts, but the one of now."""
+        keep = {self._snapshot.digest, *(each.labels.get(LABEL_SNAPSHOT, "") for each in found)}
+        try:
+            for digest in await asyncio.to_thread(self._snapshots.forget, keep):
+                log.info("old snapshot of skills removed", snapshot=digest[:12])
+        except OSError as error:
+            log.warning("old snapshots of skills were left", reason=str(error))
 
     async def _adopt(self, found: Found, engine: Engine) -> PooledContainer | None:
         name, image = found.labels.get(LABEL_ID, ""), found.labels.get(LABEL_IMAGE, "")
@@ -239,7 +285,7 @@ class Starter:
             container.info = replace(container.info, id=name, cpu=size.cpu, memory_mb=size.memory_mb)
             self.look_at_state(container)
             if found.labels.get(LABEL_STATE) != self._made(image):
-                reason = "made of another image, runner or handlers"
+                reason = "made of another image, other code or with other settings"
             else:
                 reason = await self._take_over(container)
         if not reason:
@@ -265,6 +311,7 @@ class Starter:
                 if time.monotonic() > until:
                     return f"run {reply} of the gateway before does not end"
                 await asyncio.sleep(0.05)
+            await self._check_code(container, timeout_s=ADOPT_TIMEOUT_S)
         except SwiftbotError as error:
             return error.message
         return ""
@@ -280,25 +327,26 @@ class Starter:
 
     def _made(self, image: str) -> str:
         config = self._config
-        parts = (self.reference(image), self._code, config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
+        told = json.dumps(self._told(image), sort_keys=True)
+        bounds = (config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
+        parts = (self.reference(image), self._snapshot.digest, told, bounds)
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
-    def _roots(self, image: str) -> dict[str, str]:
-        """Return where the folders of an image's skills are mounted, by folder."""
-        roots = {str(SKILLS): "/skills"}
-        for skill in self.skills(image):
-            roots.setdefault(str(skill.folder.parent), f"/skills-{len(roots)}")
-        return roots
+    def _mounted(self, image: str) -> dict[str, Path]:
+        """Return the folders of code that containers of an image mount, by their names in the snapshot."""
+        used = {RUNNER, SKILLS, *(each.folder.parent for each in self.skills(image))}
+        return {name: root for name, root in self._roots.items() if root in used}
 
-    def _runner_spec(self, info: ContainerInfo) -> dict[str, Any]:
-        """Return what a container's runner is told: see `runner/spec.py`."""
-        roots = self._roots(info.image)
-        skills = self.skills(info.image)
-        modules = [*self._catalogue.images[info.image].preload, *(name for each in skills for name in each.preload)]
+    def _told(self, image: str) -> dict[str, Any]:
+        """Return what the runners of an image are told, the same each time: see `runner/spec.py`."""
+        mounted = self._mounted(image)
+        inside = {root: f"/{name}" for name, root in mounted.items()}
+        skills = self.skills(image)
+        modules = [*self._catalogue.images[image].preload, *(name for each in skills for name in each.preload)]
         return {
             "skills": {
                 each.id: {
-                    "folder": f"{roots[str(each.folder.parent)]}/{each.folder.name}",
+                    "folder": f"{inside[each.folder.parent]}/{each.folder.name}",
                     "loads": each.loads,
                     "preload_mb": each.preload_mb,
                     "preload_s": each.preload_s,
@@ -306,17 +354,19 @@ class Starter:
                 }
                 for each in skills
             },
+            "roots": {name: f"/{name}" for name in mounted},
             "modules": list(dict.fromkeys(modules)),
             "site": self._site,
             "volumes": "/volumes",
             "reserve_mb": self._config.transfer.reserve_mb,
             "patience_s": PRELOAD_PART * self._config.start_timeout_s,
-            "proven": self._made(info.image) in self._proven,
         }
 
     def _spec(self, container: PooledContainer, facts: EngineFacts) -> ContainerSpec:
         config, info = self._config, container.info
-        binds = {str(container.folder): "/run/swiftbot", str(RUNNER): "/runner", **self._roots(info.image)}
+        snapshot = self._snapshot
+        mounts = {str(snapshot.folder / name): f"/{name}" for name in self._mounted(info.image)}
+        binds = {str(container.folder): "/run/swiftbot", **mounts}
         processes = 0 if facts.limits_enforced else config.user_processes
         inside = "/run/swiftbot"
         command = ("python3", "-s", "-m", "runner.main", "--socket", f"{inside}/{SOCKET}", "--spec", f"{inside}/{SPEC}")
@@ -325,6 +375,7 @@ class Starter:
             LABEL_ID: info.id,
             LABEL_IMAGE: info.image,
             LABEL_STATE: self._made(info.image),
+            LABEL_SNAPSHOT: snapshot.digest,
             LABEL_SIZE: msgspec.json.encode(size).decode(),
         }
         return ContainerSpec(
@@ -366,12 +417,9 @@ def _write(folder: Path, runner: dict[str, Any]) -> None:
     (folder / SPEC).write_text(json.dumps(runner), encoding="utf-8")
 
 
-def code_digest(catalogue: Catalogue) -> str:
-    """Return a hash of all code that a zygote holds: the runner and the skills with what they share."""
-    digest = hashlib.sha256()
-    roots = sorted({RUNNER, SKILLS, *(each.folder.parent for each in catalogue.skills.values())})
-    for root in roots:
-        for file in sorted(root.rglob("*")):
-            if file.suffix in (".py", ".toml") and "__pycache__" not in file.parts:
-                digest.update(f"{file}\0".encode() + file.read_bytes())
-    return digest.hexdigest()
+def _roots(catalogue: Catalogue) -> dict[str, Path]:
+    """Return the folders that a container may load code from, by the names that they have in a snapshot and in it."""
+    others = dict.fromkeys(each.folder.parent for each in catalogue.skills.values() if each.implemented)
+    others.pop(SKILLS, None)
+    numbered = {f"skills-{number}": root for number, root in enumerate(sorted(others), start=1)}
+    return {"runner": RUNNER, "skills": SKILLS, **numbered}

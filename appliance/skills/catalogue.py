@@ -24,7 +24,7 @@ from msgspec import Meta, Struct, field
 from appliance.errors import ConfigError
 
 SKILLS = Path(__file__).resolve().parent
-"""The built-in skills; bind-mounted read-only at `/skills` in every container."""
+"""The built-in skills; a snapshot of them is mounted read-only at `/skills` in every container."""
 
 DOMAINS = (
     "navigation",
@@ -42,6 +42,8 @@ NOT_SKILLS = frozenset({"_lib", "images", "sites", "__pycache__"})
 """Folders beside the skills that hold something else: shared code of handlers, images, sites."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
+WHEELHOUSE = "wheelhouse"
+"""Folder of an image with the wheels that its `requirements.txt` pins: no part of its tag, since the pins are."""
 _REPOSITORY = "localhost/swiftbot"
 _Kind = TypeVar("_Kind")
 
@@ -194,6 +196,9 @@ def load_catalogue(extra: Sequence[Path] = ()) -> Catalogue:
 def image_reference(image: str, *, folder: Path | None = None) -> str:
     """Return `localhost/swiftbot/<image>:<hash>`: a changed image folder or common recipe is a new image.
 
+    The wheelhouse is left out: `requirements.txt` pins what is used of it, and a gateway that gets the image from
+    another has none.
+
     Args:
         image: name of a folder of `images/`.
         folder: that folder itself, for an image that is not built in (`ImageSpec.folder`).
@@ -206,9 +211,11 @@ def image_reference(image: str, *, folder: Path | None = None) -> str:
         raise ConfigError(f"no image {image!r}: {where}/image.toml is missing", remedy="see docs/skills.md, Images")
     digest = hashlib.sha256((SKILLS / "images" / "recipe.toml").read_bytes())
     for file in sorted(where.rglob("*")):
-        if file.is_file() and "__pycache__" not in file.parts and not file.name.startswith("."):
+        inside = file.relative_to(where)
+        left_out = inside.parts[0] == WHEELHOUSE or "__pycache__" in inside.parts or file.name.startswith(".")
+        if file.is_file() and not left_out:
             data = file.read_bytes()
-            digest.update(f"{file.relative_to(where).as_posix()}\0{len(data)}\0".encode())
+            digest.update(f"{inside.as_posix()}\0{len(data)}\0".encode())
             digest.update(data)
     return f"{_REPOSITORY}/{image}:{digest.hexdigest()[:12]}"
 
@@ -357,6 +364,10 @@ def _images(root: Path) -> Iterator[ImageSpec]:
         _check_name(file, "name", spec.name, folder)
         if not spec.packages:
             raise _wrong(file, "packages", "an image needs at least python3")
+        if (folder / "requirements.txt").is_file():
+            from appliance.skills.requirements import read_requirements  # noqa: PLC0415 - for images that have some
+
+            read_requirements(folder / "requirements.txt")
         yield msgspec.structs.replace(spec, folder=folder)
 
 

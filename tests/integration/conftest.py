@@ -63,4 +63,4 @@ async def bench(built: None, folder: Path, catalogue: Catalogue) -> AsyncIterato
     yield it
     for pool in it.pools:
         await pool.stop(keep_containers=False)
-    await remove_fleet(it.fleet)
+    await remove_fleet(it.fleet, volumes=True)

@@ -32,4 +32,4 @@ async def fleet_in(folder: Path, **order: Any) -> AsyncIterator[FleetState]:
     try:
         yield state
     finally:
-        await local_fleet.down(wanted.directory, progress=print)
+        await local_fleet.down(wanted.directory, progress=print, volumes=True)

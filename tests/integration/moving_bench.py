@@ -174,7 +174,7 @@ async def fleet_of(
     try:
         yield state
     finally:
-        await local_fleet.down(order.directory, progress=print)
+        await local_fleet.down(order.directory, progress=print, volumes=True)
 
 
 @asynccontextmanager

@@ -109,6 +109,7 @@ class Bench:
             gateway=gateway,
             fleet=fleet,
             run_dir=self.folder / "run" / fleet / gateway,
+            data_dir=self.folder / "data" / fleet / gateway,
             catalogue=self.catalogue,
             site=Site(),
             find_remote=nobody,

@@ -59,7 +59,7 @@ async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
     try:
         yield state
     finally:
-        await local_fleet.down(order.directory, progress=print)
+        await local_fleet.down(order.directory, progress=print, volumes=True)
 
 
 async def test_a_task_by_zenoh(fleet: FleetState, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +145,7 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
         assert (planned.handed_in, planned.priority, planned.submitter) == (True, 6, "mavlink-255-190")
         assert [each.subtask.id for each in planned.subtasks] == ["up", "down"]
     finally:
-        await local_fleet.down(order.directory, progress=print)
+        await local_fleet.down(order.directory, progress=print, volumes=True)
     assert set(commands_in(state, task).values()) == {1}
     assert set(commands_in(state, "in-words").values()) == {1}
 

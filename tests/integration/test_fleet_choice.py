@@ -118,7 +118,7 @@ async def up(tmp_path: Path, skills: Path) -> AsyncIterator[Up]:
 
     yield start
     for directory in started:
-        await local_fleet.down(directory, progress=print)
+        await local_fleet.down(directory, progress=print, volumes=True)
 
 
 def one(skill: str) -> TaskRequest:

@@ -37,7 +37,7 @@ async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
     try:
         yield state
     finally:
-        await local_fleet.down(order.directory, progress=print)
+        await local_fleet.down(order.directory, progress=print, volumes=True)
 
 
 async def running(client: FleetClient, task: str, *, skill: str) -> TaskRecord:

@@ -82,7 +82,7 @@ async def up(tmp_path: Path) -> AsyncIterator[Up]:
         return await local_fleet.up(order, progress=print, timeout_s=180.0)
 
     yield start
-    await local_fleet.down(directory, progress=print)
+    await local_fleet.down(directory, progress=print, volumes=True)
 
 
 def nap(seconds: float, *, subtasks: int = 1, **fields: Any) -> TaskRequest:

@@ -193,7 +193,7 @@ async def up(tmp_path: Path, upstream: Upstream) -> AsyncIterator[Up]:
     yield start
     for directory in started:
         if (directory / "fleet.json").exists():
-            await local_fleet.down(directory, progress=print)
+            await local_fleet.down(directory, progress=print, volumes=True)
 
 
 async def follow(client: FleetClient, task: str, *, until: Callable[[TaskRecord], bool]) -> TaskRecord:

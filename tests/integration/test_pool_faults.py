@@ -207,7 +207,7 @@ async def bench(podman: Path) -> AsyncIterator[Bench]:
         assert await engine_ids(it.fleet) == []
         assert list((folder / "run" / it.fleet / "g1").iterdir()) == []
     finally:
-        await remove_fleet(it.fleet)
+        await remove_fleet(it.fleet, volumes=True)
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -120,6 +120,7 @@ async def main():
     async def none(*_): return []
     pool = Pool(PoolConfig(floor={{"base": 2}}, capacity=2, mode="local"), gateway="g1", fleet={bench.fleet!r},
         run_dir=Path({str(bench.folder / "run" / bench.fleet / "g1")!r}),
+        data_dir=Path({str(bench.folder / "data" / bench.fleet / "g1")!r}),
         catalogue=load_catalogue([Path({str(bench.folder / "skills")!r})]),
         site=Site(), find_remote=none, on_call=none, on_change=lambda c: None)
     await pool.start()
@@ -170,11 +171,11 @@ async def test_fleets_are_apart(bench: Bench) -> None:
         assert not ids[0] & ids[2]
         await pools[0].stop(keep_containers=False)
         assert await engine_ids(bench.fleet) == []
-        assert await remove_fleet(other) == 1
+        assert (await remove_fleet(other, volumes=True)).containers == 1
         assert set(await engine_ids(bench.fleet, "g2")) == ids[1]
         assert (await bench.run(pools[1], "echo")).kind is RunEventKind.SUCCEEDED
     finally:
-        await remove_fleet(other)
+        await remove_fleet(other, volumes=True)
 
 
 async def test_socket_absent(bench: Bench) -> None:

@@ -52,7 +52,8 @@ async def main(fleet, folder, moment, delay_s):
     async def none(*_): return []
     floor = {"base": 4 if moment == "start" else 2}
     pool = Pool(PoolConfig(floor=floor, capacity=4, starts_at_once=4, mode="local"), gateway="g1", fleet=fleet,
-        run_dir=Path(folder) / "run" / fleet / "g1", catalogue=load_catalogue([Path(folder) / "skills"]),
+        run_dir=Path(folder) / "run" / fleet / "g1", data_dir=Path(folder) / "data" / fleet / "g1",
+        catalogue=load_catalogue([Path(folder) / "skills"]),
         site=Site(), find_remote=none, on_call=none, on_change=lambda c: None)
     await pool.start()
     while not pool.containers():

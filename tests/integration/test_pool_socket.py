@@ -89,6 +89,7 @@ async def test_warm_containers_serve_on_while_podman_is_away(
         gateway="g1",
         fleet=fleet,
         run_dir=tmp_path / "run",
+        data_dir=tmp_path / "data",
         catalogue=catalogue,
         site=Site(),
         find_remote=nobody,
@@ -127,4 +128,4 @@ async def test_warm_containers_serve_on_while_podman_is_away(
         assert await run(9) is RunEventKind.SUCCEEDED
     finally:
         await pool.stop(keep_containers=False)
-        await remove_fleet(fleet)
+        await remove_fleet(fleet, volumes=True)

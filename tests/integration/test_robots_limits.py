@@ -45,7 +45,7 @@ async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
     try:
         yield state
     finally:
-        await local_fleet.down(order.directory, progress=print)
+        await local_fleet.down(order.directory, progress=print, volumes=True)
 
 
 class Cart:

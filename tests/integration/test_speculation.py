@@ -108,7 +108,7 @@ async def fleet(folder: Path) -> AsyncGenerator[FleetState]:
     try:
         yield state
     finally:
-        await local_fleet.down(order.directory, progress=print)
+        await local_fleet.down(order.directory, progress=print, volumes=True)
 
 
 def task(name: str, skill: str, lags_s: float, *more: Subtask) -> TaskRequest:

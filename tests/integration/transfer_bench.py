@@ -114,7 +114,7 @@ async def sides(folder: Path, ports: list[int]) -> AsyncIterator[Sides]:
     finally:
         for number in list(made.there):
             await made.stop(number)
-        await remove_fleet(made.fleet)
+        await remove_fleet(made.fleet, volumes=True)
 
 
 def tree(folder: Path) -> dict[str, tuple[int, str]]:

@@ -185,7 +185,7 @@ class Arena:
         if self._recorder is not None:
             await local_fleet.end([self._recorder], grace_s=STOP_S)
         if self._skills is not None:
-            await local_fleet.remove_containers(self.fleet, progress=progress)
+            await local_fleet.remove_containers(self.fleet, progress=progress, volumes=True)
 
 
 def loopback(count: int) -> dict[str, Site]:

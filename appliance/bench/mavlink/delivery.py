@@ -133,7 +133,7 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
             async with FleetClient(state.endpoint) as client:
                 return await _deliver(client, options, progress=progress)
         finally:
-            await local_fleet.down(order.directory, progress=progress)
+            await local_fleet.down(order.directory, progress=progress, volumes=True)
 
 
 async def _deliver(client: FleetClient, options: Options, *, progress: Progress) -> dict[str, Any]:

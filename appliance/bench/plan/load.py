@@ -103,7 +103,7 @@ async def run(
                 await asyncio.sleep(2.5)  # its status is told every two seconds
                 known = client.plane.registry.gateways.get(gateway)
         finally:
-            await local_fleet.down(order.directory, progress=progress)
+            await local_fleet.down(order.directory, progress=progress, volumes=True)
     return account(told, rate=rate, seconds=seconds) | {
         "tier": "local" if model else "rules",
         "planner": known.planner if known is not None else None,

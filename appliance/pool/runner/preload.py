@@ -9,7 +9,9 @@ not be loaded is a problem that `ping` tells; it stops nothing, and a run may tr
 
 import contextlib
 import gc
+import hashlib
 import importlib
+import importlib.machinery
 import importlib.util
 import os
 import resource
@@ -50,6 +52,18 @@ def explain(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"[:2000]
 
 
+class _Hashing(importlib.machinery.SourceFileLoader):
+    """A loader that notes the digest of the source it runs, or that its bytecode was checked against."""
+
+    digest = ""
+
+    def get_data(self, path: str) -> bytes:
+        data = super().get_data(path)
+        if path == self.path:
+            self.digest = hashlib.sha256(data).hexdigest()
+        return data
+
+
 def load_handler(skill: Skill) -> ModuleType:
     """Import `handler.py` of a skill's folder.
 
@@ -57,7 +71,8 @@ def load_handler(skill: Skill) -> ModuleType:
         ImportError: there is none, or it has no `run`. Whatever it raises itself while being imported.
     """
     path = skill.folder / "handler.py"
-    spec = importlib.util.spec_from_file_location(f"skill_{skill.name}", path)
+    name = f"skill_{skill.name}"
+    spec = importlib.util.spec_from_file_location(name, path, loader=_Hashing(name, str(path)))
     if spec is None or spec.loader is None or not path.is_file():
         raise ImportError(f"{path} does not exist")
     module = importlib.util.module_from_spec(spec)
@@ -88,6 +103,8 @@ class Loaded:
         self.values: dict[str, Any] = {}
         self.problems: dict[str, str] = {}
         """By item: `module NAME`, the skill's name for its handler, `preload NAME`, `threads of ITEM`."""
+        self.code: dict[str, str] = {}
+        """SHA-256 digests of the source files that were loaded, by `ROOT/path`; the gateway compares them."""
         self._until = time.monotonic() + spec.patience_s
 
     def handler(self, skill: Skill) -> tuple[ModuleType, Any]:
@@ -111,9 +128,32 @@ class Loaded:
             self.problems = _rehearse(self)
         self._until = time.monotonic() + self.spec.patience_s
         self.load_items(lambda _: None)
+        self.code = self._code()
         gc.collect()
         make_pages_huge()
         gc.freeze()  # children share these pages as long as nobody touches their reference counts' neighbours
+
+    def _code(self) -> dict[str, str]:
+        """Return the digests of what was loaded from the folders of code: handlers, what they share, the runner."""
+        code: dict[str, str] = {}
+        for module in tuple(sys.modules.values()):
+            file = getattr(module, "__file__", None)
+            path = self._path(Path(file)) if isinstance(file, str) and file.endswith(".py") else ""
+            if not path:
+                continue
+            loader = getattr(module, "__loader__", None)
+            digest = loader.digest if isinstance(loader, _Hashing) else ""
+            try:
+                code[path] = digest or hashlib.sha256(Path(str(file)).read_bytes()).hexdigest()
+            except OSError as error:
+                code[path] = explain(error)
+        return code
+
+    def _path(self, file: Path) -> str:
+        for name, root in self.spec.roots.items():
+            if file.is_relative_to(root):
+                return f"{name}/{file.relative_to(root).as_posix()}"
+        return ""
 
     def load_items(self, tell: Callable[[str], None]) -> None:
         """Load what is no problem yet, one by one, telling which is begun and which became a problem."""

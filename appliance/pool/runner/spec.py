@@ -31,6 +31,9 @@ class Spec:
     def __init__(self, table: Table) -> None:
         skills = cast("dict[str, Table]", table.get("skills") or {})
         self.skills = {name: Skill(name, each) for name, each in skills.items()}
+        roots = cast("dict[str, str]", table.get("roots") or {})
+        self.roots = {name: Path(str(path)) for name, path in roots.items()}
+        """Folders that code is loaded from, by the name that the gateway knows each by."""
         self.modules = tuple(str(each) for each in table.get("modules") or ())
         self.site = cast("Table", table.get("site") or {})
         self.volumes = Path(str(table.get("volumes") or "/volumes"))

@@ -174,6 +174,8 @@ class Zygote:
                 return
             case "ping":
                 reply = self._report()
+            case "hello":
+                reply = {"ok": True, "code": self._loaded.code}
             case "cancel":
                 run = self._run
                 found = run is not None and run.id == frame.get("run")

@@ -72,5 +72,5 @@ def test_only_robots_that_the_words_can_mean_are_told(text: str, robots: set[str
 
 
 def test_numbers_behind_a_kind_are_told_as_names() -> None:
-    """ "Drones 1, 2 and 3" are three robots by name."""
+    """Of "Drones 1, 2 and 3" a planner is told the three names."""
     assert told(context("Drones 1, 2 and 3 take off")).instruction == "drone_1, drone_2 and drone_3 take off"

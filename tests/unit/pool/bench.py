@@ -75,6 +75,7 @@ class Bench:
             gateway=gateway,
             fleet=fleet,
             run_dir=self.folder / "run" / fleet / gateway,
+            data_dir=self.folder / "data" / fleet / gateway,
             catalogue=self.catalogue,
             site=Site(name="yard"),
             find_remote=self.find_remote,

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 from appliance.pool.engine import ContainerSpec, EngineFacts, Found, FoundImage
-from appliance.pool.starter import RUNNER
 
 
 def environment() -> dict[str, str]:
@@ -94,13 +93,14 @@ class FakeEngine:
         for skill in runner["skills"].values():
             folder = Path(skill["folder"])
             skill["folder"] = str(Path(back[str(folder.parent)]) / folder.name)
+        runner["roots"] = {name: back[path] for name, path in runner["roots"].items()}
         file.write_text(json.dumps(runner))
         scratch = self.scratch / container
         scratch.mkdir()
         self.processes[container] = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "runner.main",
             "--socket", f"{back['/run/swiftbot']}/runner.sock", "--spec", str(file),
-            "--scratch", str(scratch), cwd=RUNNER.parent,
+            "--scratch", str(scratch), cwd=Path(back["/runner"]).parent,
             env=environment(),
         )  # fmt: skip
 

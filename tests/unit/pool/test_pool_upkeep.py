@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from appliance.errors import PoolError, RefusedError
 from appliance.model import ContainerState, Phase, RunEventKind
 from appliance.pool.api import DecisionsAsk
+from appliance.pool.container import PooledContainer
 from appliance.pool.pressure import Reading
 from appliance.pool.settings import PressureConfig
 from tests.unit.pool.bench import COLD
@@ -180,6 +182,40 @@ async def test_what_cannot_be_adopted_is_removed(bench: Any) -> None:
     after = await bench.pool()
     assert len(after.containers()) == 1
     assert len(bench.engine.specs) == 1
+
+
+async def test_a_runner_tells_what_it_has_loaded(bench: Any) -> None:
+    """Handlers, the runner itself and nothing that is not in the snapshot; broken handlers are problems instead."""
+    pool = await bench.pool(floor={"base": 1})
+    await bench.ready(pool, 1)
+    (container,) = pool._keeper.books
+    loaded = await container.hello(timeout_s=5)
+    files = pool._keeper._starter._snapshot.files
+    assert {"runner/main.py", "runner/zygote.py", "skills-1/probe/handler.py"} <= loaded.keys()
+    assert loaded.items() <= files.items()
+    assert (
+        files["skills-1/probe/handler.py"]
+        == hashlib.sha256((bench.folder / "skills" / "probe" / "handler.py").read_bytes()).hexdigest()
+    )
+
+
+async def test_a_runner_that_cannot_say_what_it_has_loaded_is_not_adopted(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of an earlier version does not know the question: it is replaced and counted."""
+    before = await bench.pool(floor={"base": 1})
+    await bench.ready(before, 1)
+    await before.stop(keep_containers=True)
+
+    async def older(self: PooledContainer, *, timeout_s: float) -> dict[str, str]:
+        del self, timeout_s
+        return {}
+
+    monkeypatch.setattr(PooledContainer, "hello", older)
+    after = await bench.pool()
+    assert after.containers() == ()
+    assert after.refused["loaded code"] == 1
+    assert bench.engine.specs == {}
 
 
 async def test_stop_removes_what_is_not_to_be_kept(bench: Any) -> None:

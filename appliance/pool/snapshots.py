@@ -1,0 +1,175 @@
+"""Immutable, content-addressed copies of the code that containers load: skill folders and the runner.
+
+Containers never mount a live folder: one that is started after an edit would run code that belongs to no digest the
+gateway knows. `Snapshots.take` copies what is on disk once, when the gateway starts, and every container mounts
+that copy read-only. The layout of the store:
+
+    objects/SHA256[x]      each distinct file once, read-only; `x`: executable
+    trees/DIGEST/ROOT/...  one snapshot; its files are hard links to the objects
+
+A tree's digest is that of its paths and bytes. Objects and trees appear under their names only when they are whole,
+and an object whose bytes no longer have its digest is written again, so neither a crash nor a damaged disk is served.
+"""
+
+import hashlib
+import os
+import secrets
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+
+from msgspec import Struct
+
+from appliance.errors import ConfigError
+from appliance.pool.bytecode import add_bytecode
+
+LEFT_OUT = frozenset({"__pycache__", ".git", ".hg", ".svn"})
+"""Names that are no part of a skill wherever they are."""
+NOT_LOADED = frozenset({"images", "sites"})
+"""Folders beside the skills of which a container loads nothing."""
+ATTEMPTS = 3
+"""How often a folder is read that changes meanwhile: an editor replaces a file in two steps."""
+_NEW = ".new-"
+
+
+class Snapshot(Struct, frozen=True, kw_only=True):
+    """One snapshot: `files` are the SHA-256 digests by path below `folder`, `ROOT/...`."""
+
+    digest: str
+    folder: Path
+    files: dict[str, str]
+
+
+def unexpected(loaded: Mapping[str, str], files: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the paths of loaded files that a snapshot does not hold with the same digest, sorted."""
+    return tuple(sorted(path for path, digest in loaded.items() if files.get(path) != digest))
+
+
+class Snapshots:
+    """The snapshot store of one gateway. Its methods block: they read and write files."""
+
+    def __init__(self, store: Path) -> None:
+        self._objects = store / "objects"
+        self._trees = store / "trees"
+
+    def take(self, roots: Mapping[str, Path]) -> Snapshot:
+        """Return a snapshot of folders, by the name that each has in it; what is stored already is linked.
+
+        Raises:
+            ConfigError: a folder cannot be read, or the store cannot be written.
+        """
+        try:
+            for folder in (self._objects, self._trees):
+                folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+                for left in folder.glob(f"{_NEW}*"):  # of a gateway that was killed meanwhile
+                    _remove(left)
+            for attempt in range(1, ATTEMPTS + 1):
+                try:
+                    return self._take(roots)
+                except FileNotFoundError:
+                    if attempt == ATTEMPTS:
+                        raise
+        except OSError as error:
+            raise ConfigError(
+                f"no snapshot of the skills can be made: {error.filename or self._trees}: {error.strerror}",
+                remedy=f"make the skill folders readable, and {self._trees.parent} writable with space left",
+            ) from error
+        raise AssertionError("unreachable")
+
+    def _take(self, roots: Mapping[str, Path]) -> Snapshot:
+        building = self._trees / f"{_NEW}{secrets.token_hex(6)}"
+        objects: dict[str, str] = {}
+        try:
+            for name, root in roots.items():
+                (building / name).mkdir(parents=True)
+                for file, path in _files(root):
+                    stored = self._store(file)
+                    objects[f"{name}/{path}"] = stored
+                    place = building / name / path
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    os.link(self._objects / stored, place)
+            listing = "".join(f"{path}\0{stored}\n" for path, stored in sorted(objects.items()))
+            digest = hashlib.sha256(os.fsencode(listing)).hexdigest()
+            folder = self._trees / digest
+            if not self._same(folder, objects):
+                add_bytecode(building)
+                if folder.exists():
+                    folder.rename(self._trees / f"{_NEW}{secrets.token_hex(6)}")
+                building.rename(folder)
+        finally:
+            _remove(building)
+        return Snapshot(
+            digest=digest, folder=folder, files={path: stored.rstrip("x") for path, stored in objects.items()}
+        )
+
+    def _store(self, file: Path) -> str:
+        """Store a file's bytes unless they are there; returns the object's name, which is of what was stored."""
+        with file.open("rb") as source:
+            suffix = "x" if os.fstat(source.fileno()).st_mode & 0o100 else ""
+            name = hashlib.file_digest(source, "sha256").hexdigest() + suffix
+            if self._whole(name):
+                return name
+            source.seek(0)
+            temporary = self._objects / f"{_NEW}{secrets.token_hex(6)}"
+            digest = hashlib.sha256()
+            with temporary.open("xb") as copy:
+                while block := source.read(2**20):
+                    digest.update(block)
+                    copy.write(block)
+                os.fchmod(copy.fileno(), 0o555 if suffix else 0o444)
+        name = digest.hexdigest() + suffix
+        temporary.replace(self._objects / name)
+        return name
+
+    def _whole(self, name: str) -> bool:
+        try:
+            with (self._objects / name).open("rb") as stored:
+                return hashlib.file_digest(stored, "sha256").hexdigest() == name.rstrip("x")
+        except FileNotFoundError:
+            return False
+
+    def _same(self, folder: Path, objects: Mapping[str, str]) -> bool:
+        """Whether a tree is there and each of its files is the very object it should be."""
+        try:
+            return all((folder / path).samefile(self._objects / stored) for path, stored in objects.items())
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+
+    def forget(self, keep: Collection[str]) -> tuple[str, ...]:
+        """Remove all snapshots but those with these digests, and the objects only they had; returns what went.
+
+        Raises:
+            OSError: something cannot be removed.
+        """
+        gone = tuple(sorted(each.name for each in self._trees.iterdir() if each.name not in keep))
+        for name in gone:
+            _remove(self._trees / name)
+        for stored in self._objects.iterdir() if gone else ():
+            if stored.stat().st_nlink == 1:
+                stored.unlink()
+        return gone
+
+
+def _files(root: Path) -> Iterator[tuple[Path, str]]:
+    """Go through the regular files of a folder of skills, each with its path below it; links are followed."""
+
+    def below(folder: Path, path: str, above: tuple[Path, ...]) -> Iterator[tuple[Path, str]]:
+        for each in sorted(folder.iterdir()):
+            if each.name in LEFT_OUT or (not path and each.name in NOT_LOADED):
+                continue
+            if each.is_dir():
+                real = each.resolve()
+                if real not in above:  # a link to a folder around it would never end
+                    yield from below(each, f"{path}{each.name}/", (*above, real))
+            elif each.is_file():
+                yield each, f"{path}{each.name}"
+
+    return below(root, "", (root.resolve(),))
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder; nothing when it is gone."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
