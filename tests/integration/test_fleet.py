@@ -80,6 +80,9 @@ async def test_a_task_by_zenoh(fleet: FleetState, monkeypatch: pytest.MonkeyPatc
         with pytest.raises(ZenohTaskRejected, match="1 to") as refused:
             await client.submit(" ")
         assert refused.value.code == "payload"
+        with pytest.raises(ZenohTaskRejected, match="this is a stop, not a task") as refused:
+            await client.submit("rover_1: stop")
+        assert refused.value.remedy == "swiftbot stop rover_1"
     assert set(commands_in(fleet, "by-zenoh").values()) == {1}
 
 
@@ -119,6 +122,8 @@ async def test_a_task_by_mavlink(tmp_path: Path) -> None:
             texts.append(list(client.follow("in-words", timeout_s=60))[-1]["state"])
             with pytest.raises(TaskRejected, match="is empty"):
                 client.submit(" ")
+            with pytest.raises(TaskRejected, match="this is a stop, not a task"):
+                client.submit("stop the drone")
             client.submit("up and down", task="by-plan", plan=UP_AND_DOWN, priority=6)
             texts.append(list(client.follow("by-plan", timeout_s=60))[-1]["state"])
             with pytest.raises(TaskRejected, match="not understood"):
