@@ -115,6 +115,7 @@ UNITS = _set(
 BY_THE_WAY = _set("via stopping calling passing")
 """Words between where a robot goes and what it passes before."""
 NOUNS_IN_ING = _set(
+    "loading unloading packing sorting meeting training cleaning briefing "
     "building painting ceiling railing crossing clearing lighting awning bearing casing wiring piping flooring "
     "scaffolding roofing glazing cladding coupling fitting opening housing mounting coating ring wing string king "
     "drawing sling spring swing sting packing tubing ducting decking siding grating plumbing rigging landing parking"

@@ -496,9 +496,7 @@ def _courteous(words: Sequence[str]) -> bool:
     )  # fmt: skip
 
 
-_ABLE = frozenset(
-    ("reach", "make", "fit", "carry", "handle", "manage", "see", "hear", "be", "have", "know", "get", "lift")
-)
+_ABLE = frozenset(("reach", "fit", "carry", "handle", "manage", "see", "hear", "have", "know", "get", "lift"))
 """Verbs behind "could the rover" that ask what it is able to do."""
 
 
@@ -534,6 +532,8 @@ def pronoun(facts: Facts) -> Iterable[Finding]:
     said = sorted(set[int]().union(*facts.account.values.values())) if facts.account.values else []
     for number, token in enumerate(tokens):
         if token.kind != "word" or token.text not in lx.PRONOUNS or number in _free_values(facts):
+            continue
+        if token.text in ("it", "there") and number in _phrased(facts):
             continue
         before = (bool(said) and said[0] < number) or any(each.kind == "robot" for each in tokens[:number])
         following = tokens[number + 1] if number + 1 < len(tokens) else None
@@ -829,6 +829,8 @@ def polarity(facts: Facts) -> Iterable[Finding]:
 
 def _implied(facts: Facts, subtask: Subtask) -> bool:
     """Whether a way is there for a thing that the site knows to be at its end."""
+    if _put_later(facts, subtask):
+        return True
     return (
         subtask.skill == "goto"
         and facts.site is not None
@@ -837,6 +839,28 @@ def _implied(facts: Facts, subtask: Subtask) -> bool:
             for each in facts.site.objects
             if any(each.name == other.params.get("object") for other in facts.plan.subtasks)
         )
+    )
+
+
+_IN_HAND = frozenset(("down", "drop", "drops", "dropping", "release", "releases", "let", "lets", "leave", "leaves"))
+"""Words of putting that say that the thing is held already."""
+
+
+def _put_later(facts: Facts, subtask: Subtask) -> bool:
+    """Whether a thing is taken because the words ask to put it somewhere: "put the orange cone at the gate"."""
+    manifest = facts.manifest(subtask)
+    if manifest is None or "load" not in manifest.ties or not subtask.params.get("object"):
+        return False
+    return any(
+        subtask.id in facts.before[each.id]
+        and each.params.get("object") == subtask.params["object"]
+        and facts.site is not None
+        and facts.site.find(str(each.params.get("at", ""))) is not None
+        and (called := {facts.reading.tokens[index].text for index in facts.account.called[each.id]})
+        and not called & _IN_HAND
+        and (m := facts.manifest(each)) is not None
+        and "load" in m.frees
+        for each in facts.plan.subtasks
     )
 
 
