@@ -144,10 +144,19 @@ class Patience:
         self._next = now + min(FIRST_S * 2**self._gone, MOST_GONE_S) * self._shorter
         self._gone = min(self._gone + 1, 16)
 
-    def answered(self, number: int, now: float, *, same: bool = True) -> None:
-        """What came of the command is there; `same`: as the first answer says, where this is not the first."""
+    def answered(self, number: int, now: float, *, same: bool = True, kept: bool = True) -> None:
+        """What came of the command is there.
+
+        Args:
+            number: the question that is answered.
+            now: when.
+            same: whether it is what the first answer said, where this is not the first.
+            kept: whether robots keep such an answer; one that was busy may do it when it is asked again.
+        """
         self._open.pop(number, None)
-        if self._answered is None:
+        if self._answered is None and not kept:
+            self._answered, self._live = number, True
+        elif self._answered is None:
             self._answered, self._confirm_at = number, now + CONFIRM_S
         elif self._live or same:
             self._answered = max(self._answered, number)

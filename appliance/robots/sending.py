@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+from collections.abc import Callable
 
 import msgspec
 import structlog
@@ -24,7 +25,13 @@ _stopping: set[asyncio.Task[None]] = set()
 
 
 async def send_command(
-    session: Session, robot: str, command: RobotCommand, *, timeout_s: float, doubtful: bool = False
+    session: Session,
+    robot: str,
+    command: RobotCommand,
+    *,
+    timeout_s: float,
+    doubtful: bool = False,
+    on_silence: Callable[[str], None] = lambda _: None,
 ) -> RobotReply:
     """Give a robot a command and wait for what comes of it.
 
@@ -32,6 +39,8 @@ async def send_command(
     same command do no harm. Cancelled, at its deadline, or given up, it tells the robot to stop that command.
 
     `doubtful`: more than one may go by that name, and each would carry it out. Those that answer are counted first.
+
+    `on_silence`: told in words when the robot has not said a word and is asked again.
 
     Returns:
         The robot's reply; what the robot could not do is in its `failure` and raises nothing.
@@ -46,7 +55,7 @@ async def send_command(
     if doubtful and (namesakes := await _namesakes(session, robot, command)) is not None:
         return namesakes
     try:
-        return await _ask_until(session, robot, command, timeout_s)
+        return await _ask_until(session, robot, command, timeout_s, on_silence)
     except (asyncio.CancelledError, DeadlineError, ContractError):
         task = asyncio.get_running_loop().create_task(_send_stop(session, robot, command))
         _stopping.add(task)
@@ -71,7 +80,9 @@ async def _namesakes(session: Session, robot: str, command: RobotCommand) -> Rob
     return RobotReply(id=command.id, failure=failure)
 
 
-async def _ask_until(session: Session, robot: str, command: RobotCommand, timeout_s: float) -> RobotReply:
+async def _ask_until(
+    session: Session, robot: str, command: RobotCommand, timeout_s: float, on_silence: Callable[[str], None]
+) -> RobotReply:
     """Ask as `Patience` says; what goes out and comes in is here, when and how often there."""
     loop = asyncio.get_running_loop()
     key, payload = session.keys.command(robot), encode(command)
@@ -86,20 +97,19 @@ async def _ask_until(session: Session, robot: str, command: RobotCommand, timeou
             match patience.next(now):
                 case Ask():
                     if patience.asks and open_:
-                        log.warning(
-                            "no word from robot, asking again",
-                            robot=robot, verb=command.verb, id=command.id, silent_s=round(patience.silence(now), 1),
-                        )  # fmt: skip
+                        note = f"no word from {robot} for {patience.silence(now):.0f} s, {command.verb} is asked again"
+                        log.warning(note, id=command.id)
+                        on_silence(note)
                     # Longer than the policy ever waits: a time that runs out is then the robot's word, not ours.
                     lasts_s = max(0.0, patience.deadline - now) + _PAST_END_S
                     number = patience.asked(now)
                     open_[asyncio.create_task(session.query(key, payload, timeout_s=lasts_s))] = number
                 case Wait(until):
-                    done, _ = (
-                        await asyncio.wait(open_, timeout=max(0.0, until - now), return_when=asyncio.FIRST_COMPLETED)
-                        if open_
-                        else (await asyncio.sleep(max(0.0, until - now), ((), ())))
-                    )
+                    left_s = max(0.0, until - now)
+                    if not open_:
+                        await asyncio.sleep(left_s)
+                        continue
+                    done, _ = await asyncio.wait(open_, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
                     # In the order in which they were sent, where several have come.
                     for task in sorted(done, key=lambda each: open_[each]):
                         number = open_.pop(task)
@@ -110,7 +120,8 @@ async def _ask_until(session: Session, robot: str, command: RobotCommand, timeou
                         except UnreachableError:
                             patience.gone(number, loop.time())
                         else:
-                            patience.answered(number, loop.time(), same=reply is None or reply == answer)
+                            same = reply is None or reply == answer
+                            patience.answered(number, loop.time(), same=same, kept=answer.failure is None)
                             reply = answer if reply is None else reply
                 case Done() if reply is not None:
                     return reply

@@ -155,15 +155,25 @@ class Registration:
         self._session = session
         self._key = f"{key}/state"
         self._info = info | {"speaker": f"{time.time_ns():020d}-{secrets.token_hex(4)}"}
+        self._token: Any = None
         until = time.monotonic() + wait_s
-        while any(reply.ok is not None for reply in session.liveliness().get(f"{key}/alive", timeout=LOOK_S)):
+        while True:
+            if not self._is_taken():
+                # One that started at the same instant holds no token yet: both show themselves first.
+                self._settle()
+                if not self._is_taken():
+                    break
             if time.monotonic() >= until:
                 self.update()  # heeded by no gateway while the other one is there, but seen
                 raise self._conflict(f"there is a robot that calls itself {info['id']}")
             time.sleep(0.5)
         # Kept here: a token that nobody holds is taken back by the garbage collector.
-        self._token: Any = session.liveliness().declare_token(f"{key}/alive")
-        self._settle()
+        self._token = session.liveliness().declare_token(f"{key}/alive")
+        self.update()
+
+    def _is_taken(self) -> bool:
+        key = self._key.removesuffix("state") + "alive"
+        return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=LOOK_S))
 
     def _settle(self) -> None:
         """Show itself for a moment: of two that start at the same instant the older has the name, as in rosters."""
@@ -183,7 +193,6 @@ class Registration:
         finally:
             heard.undeclare()
         if older.is_set():
-            self.close()
             raise self._conflict(f"another robot that calls itself {self._info['id']} started earlier")
 
     @staticmethod

@@ -353,7 +353,7 @@ async def test_of_two_robots_that_start_at_once_the_older_has_the_name(
     async def sees_nobody(*_: Any) -> bool:
         return True
 
-    monkeypatch.setattr(Rover, "_named_alone", sees_nobody)
+    monkeypatch.setattr(Rover, "_until_free", sees_nobody)
     async with gateway_process(tmp_path) as it:
         for turn in range(3):
             name, stop = f"rover_{turn}", asyncio.Event()

@@ -176,12 +176,10 @@ class Rover:
             await self._catch_up()
             if not await self._named_alone(stop):
                 return
-            self._older = ""
-            stack.callback(session.declare_alive(keys.robot_alive(self.name)).close)
-            await self._settle(stop)
             for closer in (
                 session.serve(keys.world_of(self.name), self._tell_world),
                 session.serve(keys.command(self.name), self.desk.handle),
+                session.declare_alive(keys.robot_alive(self.name)),
             ):
                 stack.callback(closer.close)
             stack.push_async_callback(self.desk.close)
@@ -192,7 +190,20 @@ class Rover:
             await self._live(stop)
 
     async def _named_alone(self, stop: asyncio.Event) -> bool:
-        """Wait until no other robot has this one's name, which is reported once; False when it is to stop first."""
+        """Wait until no other robot has this one's name; False when it is to stop first.
+
+        Raises:
+            ConflictError: one that started at the same instant is older.
+        """
+        while await self._until_free(stop):
+            # One that started at the same instant holds no token yet: both show themselves first.
+            await self._settle(stop)
+            if not await self._session.alive_now(self._session.keys.robot_alive(self.name)):
+                return not stop.is_set()
+        return False
+
+    async def _until_free(self, stop: asyncio.Event) -> bool:
+        """Wait until no robot holds the token of this name, which is reported once; False when it is to stop first."""
         session, reported, seen_at = self._session, False, -math.inf
         while await session.alive_now(session.keys.robot_alive(self.name)):
             if not reported:
@@ -224,11 +235,8 @@ class Rover:
             self._older = info.speaker
 
     async def _settle(self, stop: asyncio.Event) -> None:
-        """Show itself before it takes commands: one that started at the same instant was not there when it looked.
-
-        Raises:
-            ConflictError: an older one has the name.
-        """
+        """Show itself for a moment; ConflictError when an older one does so, too."""
+        self._older = ""  # of those that have gone
         until = time.monotonic() + _SETTLE_S
         while time.monotonic() < until and not stop.is_set():
             self._session.put(self._session.keys.robot(self.name), encode(self.info()))

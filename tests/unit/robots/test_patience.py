@@ -180,3 +180,13 @@ def test_a_restart_in_between_is_waited_out() -> None:
         return (0.0, "gone", "") if 3.0 <= now < 9.0 else (2.9, "gone", "") if now < 3.0 else (1.0, "reply", "done")
 
     assert Course(answer).end is None
+
+
+def test_a_refusal_that_is_not_kept_holds_at_once() -> None:
+    """A robot that was busy may take the same command up when it is asked again: that is no second time."""
+    policy = Patience(0.0, TIMEOUT_S)
+    for now in (0.0, FIRST_SILENCE_S):
+        assert isinstance(policy.next(now), Ask)
+        policy.asked(now)
+    policy.answered(1, 13.0, kept=False)
+    assert isinstance(policy.next(13.0), Done)
