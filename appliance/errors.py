@@ -13,7 +13,8 @@
     ├── PlanError            no valid plan for the instruction
     ├── PoolError            a container could not be started, reached or kept
     ├── RobotError           a robot did not do what was asked
-    │   └── TakenError       a pilot or a failsafe at the vehicle has it
+    │   ├── TakenError       a pilot or a failsafe at the vehicle has it
+    │   └── ContractError    its program does not answer commands, or carries one out again when it is asked again
     ├── RecordError          a log cannot be written or read
     └── CancelledByOperatorError  somebody asked for it to stop
 
@@ -159,6 +160,12 @@ class RobotError(SwiftbotError):
     """A robot did not do what was asked."""
 
     code = "robot"
+
+
+class ContractError(RobotError):
+    """A robot's program does not keep to docs/robot-contract.md: another attempt would go the same way."""
+
+    code = "contract"
 
 
 class TakenError(RobotError):

@@ -27,12 +27,14 @@ from appliance.limits import orders_of
 from appliance.llm.api import SwapAsk, Swapped
 from appliance.llm.cascade import Decomposer
 from appliance.llm.peers import PeerTier, ProposeAsk, Proposed
+from appliance.llm.settings import PlanContext
 from appliance.model import (
     ContainerInfo,
     ContainerState,
     GatewayStatus,
     LogLine,
     Need,
+    Plan,
     PoolHint,
     RunRequest,
     Site,
@@ -223,6 +225,15 @@ class Gateway:
         self._stack.push_async_callback(self.authority.close)
         self.authority.on_change.append(self._changed.set)
 
+        def problems(plan: Plan) -> tuple[str, ...]:
+            """What would be said of a plan if it was submitted: missions are held to it when they are uploaded."""
+            roster = tuple(self.plane.registry.robots.values())
+            known = {robot.id for robot in roster} >= {each.robot for each in plan.subtasks if each.robot is not None}
+            context = PlanContext(
+                instruction="a mission uploaded over MAVLink", robots=roster if known else None, site=site
+            )
+            return self.decomposer.review(plan, context).problems
+
         self._robot_tasks = RobotTasks(self.plane, config.safety)
         self.hub = RobotHub(
             config.robots,
@@ -231,7 +242,7 @@ class Gateway:
             gateway=config.id,
             site=site,
             on_task=self._robot_tasks.take,
-            tasks=self._robot_tasks.doors(),
+            tasks=replace(self._robot_tasks.doors(), problems=problems),
             gate=self.authority.refuses,
             roster=self.plane.registry.robots,
         )

@@ -11,6 +11,7 @@ from rich.markup import escape
 from appliance import console, logs
 from appliance.cli import (
     bench,
+    conformance,
     daemons,
     fleet,
     hands,
@@ -30,7 +31,23 @@ from appliance.errors import Exit, SwiftbotError
 app = App(
     name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
 )
-for part in (fleet, work, planning, moves, steer, daemons, pool, robots, hands, recordings, plane, tools, train, bench):
+for part in (
+    fleet,
+    work,
+    planning,
+    moves,
+    steer,
+    daemons,
+    pool,
+    robots,
+    hands,
+    conformance,
+    recordings,
+    plane,
+    tools,
+    train,
+    bench,
+):
     part.add_to(app)
 
 

@@ -8,13 +8,62 @@ Pure functions; angles in degrees at the door, metres everywhere.
 
 import math
 from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
-from appliance.model.site import Box, Site
+from appliance.model.site import Box, Place, Site
 
 _A = 6_378_137.0  # WGS 84 semi-major axis, metres
 _E2 = 6.694_379_990_14e-3  # first eccentricity squared
 MAX_EXTENT_M = 10_000.0
 """Beyond this from the origin a point is no point of the site."""
+
+
+FAR_M = 200.0
+"""Without a fence a coordinate further than this from all mapped places is taken for a mistake, as the skills do."""
+
+
+class OffSite(NamedTuple):
+    """Why a point is none of the site: along which axis it leaves it, and a clause such as `lies outside the fence`."""
+
+    axis: Literal["x", "y", "z"]
+    why: str
+
+
+def off_site(site: Site, place: Place) -> OffSite | None:
+    """Return why a point cannot be gone to: outside the fence, above the altitude limit, underground; None if it can.
+
+    Plans and uploaded missions are both held to this, so that what one accepts the other does not refuse.
+    """
+    if (beyond := _beyond(site, place)) is not None:
+        return beyond
+    why = off_height(site, place.z)
+    return OffSite("z", why) if why else None
+
+
+def off_height(site: Site, z: float) -> str:
+    """Return why a height over the site's ground, metres, is none that a robot may be sent to; "" if it is one."""
+    if z > site.altitude_limit_m:
+        return f"is {z:g} m up, above this site's limit of {site.altitude_limit_m:g} m"
+    if z < 0:
+        return f"is {-z:g} m under the ground"
+    return ""
+
+
+def _beyond(site: Site, place: Place) -> OffSite | None:
+    fence = site.fence
+    if fence is not None:
+        inside_x = fence.x[0] <= place.x <= fence.x[1]
+        if inside_x and fence.y[0] <= place.y <= fence.y[1]:
+            return None
+        extent = f"(x {fence.x[0]:g} to {fence.x[1]:g} m, y {fence.y[0]:g} to {fence.y[1]:g} m)"
+        return OffSite("y" if inside_x else "x", f"lies outside the fence {fence.name} {extent}")
+    for axis, at, mapped in (
+        ("x", place.x, [each.x for each in site.places.values()] or [0.0]),
+        ("y", place.y, [each.y for each in site.places.values()] or [0.0]),
+    ):
+        if not min(mapped) - FAR_M <= at <= max(mapped) + FAR_M:
+            return OffSite("x" if axis == "x" else "y", f"lies more than {FAR_M:g} m outside the site")
+    return None
 
 
 def _metres_per_degree(latitude_deg: float, altitude_m: float) -> tuple[float, float]:

@@ -12,7 +12,15 @@ from typing import Any, cast
 import structlog
 from msgspec import Struct
 
-from appliance.errors import DeadlineError, PayloadError, PoolError, RobotError, SwiftbotError, UnreachableError
+from appliance.errors import (
+    ContractError,
+    DeadlineError,
+    PayloadError,
+    PoolError,
+    RobotError,
+    SwiftbotError,
+    UnreachableError,
+)
 from appliance.model import Failure, Phase, RunEvent, RunEventKind, RunRequest
 from appliance.pool.container import Connection, Frame
 
@@ -34,6 +42,8 @@ MAX_CALLS = 8
 ALIVE_S = 2.0
 """How often a run that waits for an answer of the appliance counts as alive: that wait has a deadline of its own."""
 _TRANSIENT = (UnreachableError, DeadlineError, RobotError, PoolError)
+_LASTING = ContractError
+"""Though it is a RobotError: another attempt would wait as long again, for nothing."""
 
 
 class Call(Struct, frozen=True, kw_only=True):
@@ -270,7 +280,9 @@ class Conversation:
         try:
             reply = {"n": call.number, "ok": await self._answer(call)}
         except SwiftbotError as error:
-            reply = self._refusal(call.number, error, retryable=isinstance(error, _TRANSIENT))
+            reply = self._refusal(
+                call.number, error, retryable=isinstance(error, _TRANSIENT) and not isinstance(error, _LASTING)
+            )
         except Exception as error:
             log.exception("call broke", run=call.run.run_id, call=call.name)
             reply = self._refusal(call.number, SwiftbotError(f"{type(error).__name__}: {error}"), retryable=True)

@@ -1,4 +1,4 @@
-"""Commands to robots: the caller's side (`send_command`) and the side that executes them (`CommandDesk`).
+"""Commands to robots: the side that executes them (`CommandDesk`); the caller's is in `sending`.
 
 A command may take a minute and a query may be lost, so neither side trusts the other to be there the whole time:
 the caller asks again with the same id until its deadline, and the desk joins it to the command under way or
@@ -16,28 +16,18 @@ import msgspec
 import structlog
 from msgspec import Struct, field
 
-from appliance.errors import DeadlineError, PayloadError, RobotError, SwiftbotError, UnreachableError
+from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
 from appliance.model import Failure, RobotCommand, RobotReply, encode
 from appliance.plane.session import Session
 from appliance.robots.ledger import Ledger, Verdict
+from appliance.robots.patience import LONG_POLL_S
 from appliance.robots.verbs import RobotFailure, StopArgs, args_of, parse_args
 
 log = structlog.get_logger(__name__)
 
 UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 """What comes of bytes that are no JSON of the kind; the last: nested a thousand deep."""
-LONG_POLL_S = 10.0
-"""Longest that a query is held before its caller is told to ask again."""
-GRACE_S = 2.0
-"""How much longer than that the caller waits for the answer."""
-UNREACHABLE_S = 8.0
-"""A robot that nobody has answered for so long is given up: a restarting gateway is back sooner."""
-_COUNT_S = 1.0
-"""How long those that go by a name have to say that they are there."""
-_ASK_AGAIN_S = 0.2
-_STOP_TIMEOUT_S = 3.0
-_MAX_ID = 200
-_MAX_WHY = 300
+MAX_ID = 200
 
 
 class Done(Struct, frozen=True):
@@ -121,9 +111,9 @@ class CommandDesk:
         except UNREADABLE as error:
             self._count("command_malformed")
             raise PayloadError(f"{key}: not a RobotCommand: {error}", remedy="send RobotCommand as JSON") from error
-        if not 1 <= len(command.id) <= _MAX_ID:
+        if not 1 <= len(command.id) <= MAX_ID:
             self._count("command_malformed")
-            raise PayloadError(f"{key}: a command id has 1 to {_MAX_ID} characters")
+            raise PayloadError(f"{key}: a command id has 1 to {MAX_ID} characters")
         return encode(await self.execute(command))
 
     async def execute(self, command: RobotCommand) -> RobotReply:
@@ -292,108 +282,3 @@ def _named(command: RobotCommand) -> str:
     """What ended another command, with its reason where it gives one."""
     why = command.args.get("why")
     return f"{command.verb} ({command.id})" + (f": {why}" if isinstance(why, str) and why else "")
-
-
-_stopping: set[asyncio.Task[None]] = set()
-"""Stops on their way, kept from the garbage collector."""
-
-
-async def send_command(
-    session: Session, robot: str, command: RobotCommand, *, timeout_s: float, doubtful: bool = False
-) -> RobotReply:
-    """Give a robot a command and wait for what comes of it.
-
-    The same id is sent again while the deadline allows, so a lost query, a restarting gateway and a second caller
-    with the same command do no harm. Cancelled, or at its deadline, it tells the robot to stop that command.
-
-    `doubtful`: more than one may go by that name, and each would carry it out. Those that answer are counted first.
-
-    Returns:
-        The robot's reply; what the robot could not do is in its `failure` and raises nothing.
-
-    Raises:
-        UnreachableError: nobody answers for the robot.
-        DeadlineError: the command did not end in `timeout_s` seconds.
-        RobotError: the answer is no RobotReply.
-        SwiftbotError: what else the answering side refused, such as PayloadError.
-    """
-    if doubtful and (namesakes := await _namesakes(session, robot, command)) is not None:
-        return namesakes
-    try:
-        return await _ask_until(session, robot, command, timeout_s)
-    except (asyncio.CancelledError, DeadlineError):
-        task = asyncio.get_running_loop().create_task(_send_stop(session, robot, command))
-        _stopping.add(task)
-        task.add_done_callback(_stopping.discard)
-        raise
-
-
-async def _namesakes(session: Session, robot: str, command: RobotCommand) -> RobotReply | None:
-    """Return the refusal of a command that several robots of one name would carry out; None where there is one."""
-    if command.verb in ("state", "stop"):
-        return None
-    asked = RobotCommand(id=f"{command.id[:150]}~who", verb="state")
-    count = await session.answerers(session.keys.command(robot), encode(asked), timeout_s=_COUNT_S)
-    if count <= 1:
-        return None
-    session.refuse("namesake robot/*/command", robot=robot, answer=count)
-    failure = Failure(
-        code="refused",
-        message=f"{count} robots answer to the name {robot}, and each would do it",
-        remedy="give each a name of its own",
-    )
-    return RobotReply(id=command.id, failure=failure)
-
-
-async def _ask_until(session: Session, robot: str, command: RobotCommand, timeout_s: float) -> RobotReply:
-    loop = asyncio.get_running_loop()
-    heard = loop.time()
-    deadline = heard + timeout_s
-    key, payload = session.keys.command(robot), encode(command)
-    silent: UnreachableError | None = None
-    while (remaining := deadline - loop.time()) > 0:
-        try:
-            answer = await session.query(key, payload, timeout_s=min(remaining, LONG_POLL_S + GRACE_S))
-        except DeadlineError:
-            heard, silent = loop.time(), None
-            continue
-        except UnreachableError as error:
-            silent = error
-            if loop.time() - heard >= UNREACHABLE_S:
-                break
-            await asyncio.sleep(min(_ASK_AGAIN_S, max(deadline - loop.time(), 0.0)))
-            continue
-        try:
-            return msgspec.json.decode(answer, type=RobotReply)
-        except UNREADABLE as error:
-            raise RobotError(f"{robot} answered {command.verb} with something else: {error}") from error
-    if silent is not None:
-        raise UnreachableError(
-            f"no answer from robot {robot}: {silent.message}",
-            remedy="`swiftbot robots` shows who is online; is its gateway up?",
-        ) from silent
-    raise DeadlineError(f"{robot} did not end {command.verb} within {timeout_s:g} s", remedy="allow more time")
-
-
-async def hold_robot(session: Session, robot: str, *, why: str, identity: str, timeout_s: float = 10.0) -> RobotReply:
-    """Make a robot hold where it is: what its base does ends with `why`, and it stays until the next command.
-
-    A vehicle in the air hovers, one on the ground stands. A robot that a pilot or a failsafe has is left to them, and
-    the reply says so. Same `identity`: same hold.
-
-    Raises:
-        UnreachableError, DeadlineError, RobotError: as `send_command`.
-    """
-    command = RobotCommand(id=identity, verb="hold", args={"why": why[:_MAX_WHY]})
-    return await send_command(session, robot, command, timeout_s=timeout_s)
-
-
-async def _send_stop(session: Session, robot: str, command: RobotCommand) -> None:
-    """Best effort: a robot that cannot be reached now will be told by the operator."""
-    stop = msgspec.structs.replace(
-        command, id=f"{command.id[:150]}~stop{command.attempt}", verb="stop", args={"id": command.id}
-    )
-    try:
-        await session.query(session.keys.command(robot), encode(stop), timeout_s=_STOP_TIMEOUT_S)
-    except SwiftbotError as error:
-        log.warning("stop not delivered", robot=robot, id=command.id, error=str(error))

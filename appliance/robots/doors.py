@@ -4,7 +4,7 @@ from collections.abc import Awaitable, Callable
 
 from msgspec import Struct
 
-from appliance.model import TaskRecord, TaskRequest
+from appliance.model import Plan, TaskRecord, TaskRequest
 
 
 class Tasks(Struct, frozen=True):
@@ -19,3 +19,5 @@ class Tasks(Struct, frozen=True):
     look: Callable[[str], Awaitable[TaskRecord]]
     submit_of: Callable[[str, TaskRequest], Awaitable[TaskRecord]] | None = None
     """None: queries of robots are not answered here."""
+    problems: Callable[[Plan], tuple[str, ...]] = lambda _: ()
+    """What is wrong with a plan, each as a sentence: what has problems here would not run if it was submitted."""

@@ -13,6 +13,7 @@ import asyncio
 import json
 import queue
 import secrets
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from typing import Any, cast
@@ -24,6 +25,9 @@ LOOK_S = 5.0
 
 NAME_S = 12.0
 """How long a name that another robot has is waited for: one that was cut off is seen to be gone by then."""
+SETTLE_S = 0.8
+"""How long a robot shows itself before its name is its own: one that started at the same instant is heard by then."""
+_STATE_S = 0.2
 
 Record = dict[str, Any]
 
@@ -151,19 +155,49 @@ class Registration:
         self._session = session
         self._key = f"{key}/state"
         self._info = info | {"speaker": f"{time.time_ns():020d}-{secrets.token_hex(4)}"}
+        self._token: Any = None
         until = time.monotonic() + wait_s
-        while any(reply.ok is not None for reply in session.liveliness().get(f"{key}/alive", timeout=LOOK_S)):
+        while True:
+            if not self._is_taken():
+                # One that started at the same instant holds no token yet: both show themselves first.
+                self._settle()
+                if not self._is_taken():
+                    break
             if time.monotonic() >= until:
                 self.update()  # heeded by no gateway while the other one is there, but seen
-                raise ZenohTaskRejected(
-                    f"there is a robot that calls itself {info['id']}",
-                    code="conflict",
-                    remedy="give each a name of its own",
-                )
+                raise self._conflict(f"there is a robot that calls itself {info['id']}")
             time.sleep(0.5)
         # Kept here: a token that nobody holds is taken back by the garbage collector.
-        self._token: Any = session.liveliness().declare_token(f"{key}/alive")
+        self._token = session.liveliness().declare_token(f"{key}/alive")
         self.update()
+
+    def _is_taken(self) -> bool:
+        key = self._key.removesuffix("state") + "alive"
+        return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=LOOK_S))
+
+    def _settle(self) -> None:
+        """Show itself for a moment: of two that start at the same instant the older has the name, as in rosters."""
+        own, older = str(self._info["speaker"]), threading.Event()
+
+        def take(sample: Any) -> None:
+            other = _table(sample.payload.to_bytes()).get("speaker")
+            if isinstance(other, str) and other and other < own:
+                older.set()
+
+        heard = self._session.declare_subscriber(self._key, take)
+        until = time.monotonic() + SETTLE_S
+        try:
+            while time.monotonic() < until and not older.is_set():
+                self.update()
+                older.wait(_STATE_S)
+        finally:
+            heard.undeclare()
+        if older.is_set():
+            raise self._conflict(f"another robot that calls itself {self._info['id']} started earlier")
+
+    @staticmethod
+    def _conflict(message: str) -> ZenohTaskRejected:
+        return ZenohTaskRejected(message, code="conflict", remedy="give each a name of its own")
 
     def update(self, **state: Any) -> None:
         """Tell its state: fields of RobotInfo such as `pose`, `battery_percent`, `mode`; some times a second."""

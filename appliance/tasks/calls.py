@@ -23,7 +23,7 @@ from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.pool.pool import Call
 from appliance.robots.bounds import CHOSEN
-from appliance.robots.commands import send_command
+from appliance.robots.sending import send_command
 from appliance.tasks.api import ArtifactAsk, ArtifactPiece
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.bounds import MAX_RUN_S, clean
@@ -112,8 +112,9 @@ class Calls:
             left = give_up - time.monotonic()
             doubtful = self._plane.registry.doubtful(run.robot)
             reply = await send_command(
-                self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful
-            )
+                self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful,
+                on_silence=lambda note: self._on_wait(call, note),
+            )  # fmt: skip
             if reply.failure is None:
                 return _answer(reply)
             if reply.failure.code == "cancelled" and await self._was_stopped(run.robot):

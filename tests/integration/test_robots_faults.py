@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import socket
 import sys
 import time
 from collections import Counter
@@ -12,12 +13,14 @@ import msgspec
 import pytest
 from robots_process import BEAT, STATION, beats, gateway_process, open_zenoh, read_frames, swiftbot
 
-from appliance.errors import RefusedError
+from appliance.errors import ConflictError, RefusedError
 from appliance.local_fleet import FleetState
 from appliance.model import Notice, Pose, RobotCommand, RobotInfo, RobotReply, encode
-from appliance.robots.mavlink.dialect import Codec, make
+from appliance.robots.mavlink.dialect import Codec, frame_length, make
 from appliance.robots.settings import RobotsConfig, Template
+from appliance.robots.sim.zenoh_robot import RobotSettings, Rover, run_robot
 from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskRejected
+from appliance.skills.sites import load_site
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 FOREIGN = bytes.fromhex("fd06000000050161ea0001020304fdff2ab4")
@@ -340,3 +343,94 @@ class Cart:
         self._token.undeclare()
         self._served.undeclare()
         self._session.close()
+
+
+async def test_of_two_robots_that_start_at_once_the_older_has_the_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither sees the other when it looks: the younger ends with the reason, and orders reach the older."""
+
+    async def sees_nobody(*_: Any) -> bool:
+        return True
+
+    monkeypatch.setattr(Rover, "_until_free", sees_nobody)
+    async with gateway_process(tmp_path) as it:
+        for turn in range(3):
+            name, stop = f"rover_{turn}", asyncio.Event()
+            settings = RobotSettings(
+                name=name, fleet=it.fleet.fleet, connect=tuple(it.fleet.endpoints), site=load_site("warehouse")
+            )
+            both = [asyncio.create_task(run_robot(settings, stop=stop)) for _ in range(2)]
+            try:
+                (ended,), (going,) = await asyncio.wait(both, timeout=20.0, return_when=asyncio.FIRST_COMPLETED)
+                with pytest.raises(ConflictError, match=f"another robot is called {name}, and started earlier"):
+                    ended.result()
+                await it.until(lambda name=name: name in it.robots() and it.robots()[name].online)
+                lease = await it.client.take_over(name, lease_s=10.0)
+                await it.client.drive(lease, "goto", timeout_s=30.0, waypoints=[{"x": 3.0, "y": 8.0}], speed_mps=1.0)
+                await it.client.give_back(lease)
+                assert not going.done()
+            finally:
+                stop.set()
+                await asyncio.gather(*both, return_exceptions=True)
+
+
+async def test_of_two_client_libraries_that_register_at_once_one_has_the_name(tmp_path: Path) -> None:
+    """The other one raises, and the list shows the one that has it."""
+    async with gateway_process(tmp_path) as it:
+        sessions = [await asyncio.to_thread(open_zenoh, it.fleet) for _ in range(2)]
+        try:
+            clients = [AsyncZenohTaskClient(each, fleet=it.fleet.fleet, robot="cart_9") for each in sessions]
+            got = await asyncio.gather(*(each.register(wait_s=2.0) for each in clients), return_exceptions=True)
+            (refused,) = [each for each in got if isinstance(each, ZenohTaskRejected)]
+            assert refused.code == "conflict"
+            await it.until(lambda: "cart_9" in it.robots() and it.robots()["cart_9"].online)
+        finally:
+            for each in sessions:
+                await asyncio.to_thread(each.close)
+
+
+async def test_what_a_ground_station_says_in_a_real_flight_makes_no_robot(tmp_path: Path, data: Path) -> None:
+    """A submarine's log, played from one end, then all else that system 255 may say: the list has the submarine."""
+    log = (data / "mavlink/ardusub-4.1.1-small.tlog").read_bytes()
+    frames: list[bytes] = []
+    at = 0
+    while at < len(log) and len(frames) < 6000:
+        length = frame_length(log, at + 8) or 0
+        frames.append(log[at + 8 : at + 8 + length])
+        at += 8 + length
+    assert any(each[0] == 0xFD and each[5] == 255 for each in frames)
+    station, zeros = Codec(255, 190), {f"param{number}": 0.0 for number in range(1, 8)}
+    target = {"target_system": 1, "target_component": 1}
+    said = [
+        make("HEARTBEAT", **STATION),
+        make("PARAM_REQUEST_LIST", **target),
+        make("COMMAND_LONG", command=512, confirmation=0, **target, **zeros),
+        make("MANUAL_CONTROL", target=1, x=0, y=0, z=500, r=0, buttons=0),
+        make("SYSTEM_TIME", time_unix_usec=1, time_boot_ms=1),
+        make("MISSION_REQUEST_LIST", mission_type=0, **target),
+        make("TIMESYNC", tc1=0, ts1=1),
+        make("STATUSTEXT", severity=6, text=b"hello", id=0, chunk_seq=0),
+        make("GLOBAL_POSITION_INT", time_boot_ms=1, lat=1, lon=1, alt=0, relative_alt=0, vx=0, vy=0, vz=0, hdg=0),
+    ]
+    for route in (True, False):
+        (tmp_path / str(route)).mkdir()
+        async with gateway_process(tmp_path / str(route), RobotsConfig(route=route)) as it:
+            end = it.connect("udp", await it.link("udp"))
+            for number in range(0, len(frames), 50):
+                for each in frames[number : number + 50]:
+                    end.send(each)
+                await asyncio.sleep(0.02)  # a datagram socket's buffer holds no more
+            codecs = [station, *(Codec(255, component) for component in (1, 0, 25, 191, 240))]
+            beats_of = [Codec(255, component).pack(make("HEARTBEAT", **STATION)) for component in (1, 0, 25, 191, 240)]
+
+            def act(codecs: list[Codec] = codecs, beats_of: list[bytes] = beats_of, end: socket.socket = end) -> None:
+                for each in (*(codec.pack(message) for codec in codecs for message in said), *beats_of):
+                    end.send(each)
+
+            until = time.monotonic() + 3.0
+            await it.until(lambda until=until: "drone_1" in it.robots() and time.monotonic() > until, act)
+            code, printed = await swiftbot(it.fleet, "robots", "list")
+            assert code == 0
+            assert "255" not in printed
+            assert set(it.robots()) == {"drone_1"}

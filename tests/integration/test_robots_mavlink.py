@@ -17,9 +17,9 @@ from appliance.model import Place, RobotCommand, RobotInfo, RobotReply, Site, en
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.robots.commands import send_command
 from appliance.robots.hub import RobotHub
 from appliance.robots.mavlink.dialect import Codec, make
+from appliance.robots.sending import send_command
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from appliance.robots.sim.mavlink import VehicleSettings
 

@@ -15,8 +15,8 @@ from appliance.model import Box, Failure, Place, RobotCommand, RobotInfo, RobotR
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.robots.commands import hold_robot, send_command
 from appliance.robots.hub import RobotHub
+from appliance.robots.sending import hold_robot, send_command
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from appliance.robots.sim.mavlink import VehicleSettings
 

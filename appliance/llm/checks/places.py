@@ -1,7 +1,7 @@
 """Places: what a text names on a site, and whether a robot may go there. Pure.
 
-One parser reads coordinates for plans, missions and the policy: two numbers, or three with a height, in metres of the
-site. The skills in their containers read the same forms (`skills/_lib/places.py`), held together by a test.
+One parser reads coordinates for plans, missions, the policy and the skills in their containers: two numbers, or three
+with a height, in metres of the site (`skills/_lib/coordinates.py`).
 """
 
 import math
@@ -10,6 +10,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeGuard
 
 from appliance.model import Box, Place, Site, Subtask
+from appliance.model.geo import off_site
+from appliance.skills._lib.coordinates import COORDINATE, read
 from appliance.skills.sites import plain_name
 
 SAME_SPOT_M = 1.0
@@ -17,11 +19,6 @@ SAME_SPOT_M = 1.0
 MOST_PARTS = 64
 GEOGRAPHIC_DEG = 0.5
 """A pair of numbers as near as this to the site's latitude and longitude is meant as such, where it has decimals."""
-_NUMBER = r"[-+−]?\d{1,6}(?:\.\d+)?"
-COORDINATE = re.compile(
-    rf"\(?\s*x?\s*=?\s*({_NUMBER})\s*m?\s*[,; ]\s*y?\s*=?\s*({_NUMBER})\s*m?"
-    rf"(?:\s*[,; ]\s*z?\s*=?\s*({_NUMBER})\s*m?)?\s*\)?"
-)
 _IN_BRACKETS = re.compile(r"\([^()]*\)")
 _PAIR = re.compile(rf"(?:^|[(;>]|\b(?:to|via|at|from|through|then|and)\s)\s*({_NUMBER})\s*,\s*({_NUMBER})(?![\w.])")
 """A pair of figures that a route names as a point."""
@@ -31,11 +28,8 @@ _SPLIT = re.compile(r"[,;]|->|→|\b(?:then|and|via|to|from)\b")
 
 def coordinate(text: str) -> Place | None:
     """Return the point that a text such as "12.5, 7", "(3, 4, 8)" or "x=3 y=4" names, metres; None for any other."""
-    match = COORDINATE.fullmatch(text.strip())
-    if match is None:
-        return None
-    x, y, z = (float((each or "0").replace("−", "-")) for each in match.groups())
-    return Place(x=x, y=y, z=z)
+    point = read(text)
+    return None if point is None else Place(x=point[0], y=point[1], z=point[2])
 
 
 def locate(name: str, site: Site) -> Place | None:
@@ -93,31 +87,8 @@ def nearest(name: str, site: Site) -> str:
 
 def outside(place: Place, site: Site) -> str:
     """Return why a point cannot be gone to: outside the fence, or above or below what the site allows; "" if it can."""
-    fence = site.fence
-    if fence is not None and not (fence.x[0] <= place.x <= fence.x[1] and fence.y[0] <= place.y <= fence.y[1]):
-        return (
-            f"lies outside the fence {fence.name} "
-            f"(x {fence.x[0]:g} to {fence.x[1]:g} m, y {fence.y[0]:g} to {fence.y[1]:g} m)"
-        )
-    if fence is None and (far := _far(place, site)):
-        return far
-    if place.z > site.altitude_limit_m:
-        return f"is {place.z:g} m up, above this site's limit of {site.altitude_limit_m:g} m"
-    if place.z < 0:
-        return f"is {-place.z:g} m under the ground"
-    return ""
-
-
-FAR_M = 200.0
-"""Without a fence a coordinate further than this from all mapped places is taken for a mistake, as the skills do."""
-
-
-def _far(place: Place, site: Site) -> str:
-    xs = [each.x for each in site.places.values()] or [0.0]
-    ys = [each.y for each in site.places.values()] or [0.0]
-    if min(xs) - FAR_M <= place.x <= max(xs) + FAR_M and min(ys) - FAR_M <= place.y <= max(ys) + FAR_M:
-        return ""
-    return f"lies more than {FAR_M:g} m outside the site"
+    found = off_site(site, place)
+    return "" if found is None else found.why
 
 
 def geographic(place: Place, text: str, site: Site) -> bool:
@@ -125,7 +96,8 @@ def geographic(place: Place, text: str, site: Site) -> bool:
     decimals = [len(each.partition(".")[2]) for each in re.findall(r"\d+\.\d+", text)]
     near = abs(place.x - site.latitude_deg) < GEOGRAPHIC_DEG and abs(place.y - site.longitude_deg) < GEOGRAPHIC_DEG
     swapped = abs(place.y - site.latitude_deg) < GEOGRAPHIC_DEG and abs(place.x - site.longitude_deg) < GEOGRAPHIC_DEG
-    return (near or swapped) or (len(decimals) >= 2 and min(decimals) >= 4)
+    # A large site has points in metres that are as near: nobody tells a place on Earth to a tenth of a degree.
+    return ((near or swapped) and max(decimals, default=0) >= 2) or (len(decimals) >= 2 and min(decimals) >= 4)
 
 
 def place_problems(subtask: Subtask, site: Site, *, moves: bool = True) -> Iterable[str]:

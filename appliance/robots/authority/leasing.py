@@ -22,7 +22,7 @@ from appliance.plane.session import Closer
 from appliance.robots.authority.api import DriveAsk, GiveAsk, RenewAsk, TakeAsk
 from appliance.robots.authority.leases import GIVEN_BACK, Leases
 from appliance.robots.authority.telling import tell_to_hold
-from appliance.robots.commands import send_command
+from appliance.robots.sending import send_command
 
 log = structlog.get_logger(__name__)
 

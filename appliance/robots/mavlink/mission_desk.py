@@ -10,7 +10,7 @@ Source: MAVLink guide, "Mission Protocol".
 import asyncio
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -73,6 +73,7 @@ class MissionDesk:
         store: keeps the missions.
         refused: counters of bad input.
         clock: monotonic seconds.
+        problems: what is wrong with a plan; a mission whose plan has problems is refused, since it would never run.
     """
 
     def __init__(
@@ -83,8 +84,10 @@ class MissionDesk:
         store: KeyValues,
         refused: dict[str, int],
         clock: Callable[[], float],
+        problems: Callable[[Plan], Sequence[str]] = lambda _: (),
     ) -> None:
         self._config = config
+        self._problems = problems
         self._site = site
         self._store = store
         self._refused = refused
@@ -230,7 +233,7 @@ class MissionDesk:
             return
         del self._uploads[sender]
         try:
-            plan = plan_of(upload.items, robot=upload.robot, site=self._site)
+            plan = self._plan(upload)
         except UnfitItem as error:
             self._note("mission_refused")
             self._say(reply, f"mission: {error}", texts.ERROR)
@@ -239,6 +242,13 @@ class MissionDesk:
             return
         log.info("mission uploaded", robot=upload.robot, items=upload.count, subtasks=len(plan.subtasks))
         self._begin_keeping(frame, upload.robot, tuple(upload.items), reply)
+
+    def _plan(self, upload: _Upload) -> Plan:
+        """Return what a mission means; UnfitItem where that would not run."""
+        plan = plan_of(upload.items, robot=upload.robot, site=self._site)
+        if problems := self._problems(plan):
+            raise UnfitItem(DENIED, problems[0])
+        return plan
 
     def _ask(self, sender: tuple[int, int], upload: _Upload, now: float) -> None:
         upload.asked_at = now

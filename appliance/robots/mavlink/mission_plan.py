@@ -17,14 +17,19 @@ import math
 from collections.abc import Sequence
 
 from msgspec import Struct
+from msgspec.structs import replace
 
-from appliance.model import Plan, Site, Subtask, Tier
-from appliance.model.geo import MAX_EXTENT_M, inside, to_site
+from appliance.model import Place, Plan, Site, Subtask, Tier
+from appliance.model.geo import MAX_EXTENT_M, inside, off_height, off_site, to_site
 from appliance.robots.mavlink.dialect import constant, label
 
 MAX_PICTURES = 10
 MAX_LAPS = 20
 MAX_HOLD_S = 3600.0
+MAX_PATH = 480
+"""Characters of one path's text, within what a plan's parameter may have; a longer way is several subtasks."""
+DATUM_M = 1.0
+"""A point so little under the ground is on it: heights of the map and of satellites differ by as much."""
 
 _WAYPOINT, _TAKEOFF, _LAND, _RETURN = (
     constant(f"MAV_CMD_NAV_{name}") for name in ("WAYPOINT", "TAKEOFF", "LAND", "RETURN_TO_LAUNCH")
@@ -45,6 +50,10 @@ INVALID = constant("MAV_MISSION_INVALID")
 DENIED = constant("MAV_MISSION_DENIED")
 _FIRST_PARAM = constant("MAV_MISSION_INVALID_PARAM1")
 """Of param1; those of the other parameters follow."""
+_X, _Y, _Z = (constant(f"MAV_MISSION_INVALID_{name}") for name in ("PARAM5_X", "PARAM6_Y", "PARAM7"))
+"""Of latitude, longitude and altitude: MAVLink's x is the latitude, which is the site's y."""
+_UNSET = 2**31 - 1
+"""A latitude or longitude that is not given, in MISSION_ITEM_INT."""
 
 
 class Item(Struct, frozen=True, kw_only=True):
@@ -73,7 +82,7 @@ class _Maker:
 
     def __init__(self, robot: str, site: Site) -> None:
         self._robot = robot
-        self._site = site
+        self.site = site
         self.subtasks: list[Subtask] = []
         self.here = ""
         """The place flown to last."""
@@ -85,6 +94,10 @@ class _Maker:
         self._go()
         self._append(skill, params)
 
+    def hold(self, seconds: float) -> None:
+        """Add a stay; 0: until the next subtask begins."""
+        self.add("hold", **({"duration_s": seconds} if seconds > 0 else {}))
+
     def pass_by(self, place: str) -> None:
         """Add a waypoint; several in a row are one way."""
         if self.speed is not None:
@@ -94,11 +107,14 @@ class _Maker:
 
     def _go(self) -> None:
         way, self._way = self._way, []
-        if len(way) > 1:
-            self._append("follow_path", {"path": "; ".join(way)})
-        elif way:
-            speed = {} if self.speed is None else {"speed_mps": self.speed}
-            self._append("goto", {"place": way[0], **speed})
+        while way:
+            count = _fitting(way)
+            leg, way = way[:count], way[count:]
+            if len(leg) > 1:
+                self._append("follow_path", {"path": "; ".join(leg)})
+            else:
+                speed = {} if self.speed is None else {"speed_mps": self.speed}
+                self._append("goto", {"place": leg[0], **speed})
 
     def _append(self, skill: str, params: dict[str, object]) -> None:
         after = (self.subtasks[-1].id,) if self.subtasks else ()
@@ -113,24 +129,59 @@ class _Maker:
     def place(self, number: int, item: Item) -> str:
         """Return an item's position as places are written; UnfitItem when it is none a robot may be sent to."""
         what = f"item {number}"
+        z = self.height(number, item)
+        x, y, _ = to_site(self.site, item.x / 1e7, item.y / 1e7, 0.0)
+        # What latitude and longitude cannot be first: 91 degrees north is no point of any map.
+        if abs(item.x) > 90 * 10**7 or max(abs(x), abs(y)) > MAX_EXTENT_M:
+            which = _X if abs(item.x) > 90 * 10**7 or abs(y) > MAX_EXTENT_M else _Y
+            raise UnfitItem(which, f"{what}: more than {MAX_EXTENT_M / 1e3:g} km from the site")
+        spot = Place(x=round(x, 1), y=round(y, 1), z=z)  # satellites are no better
+        if (off := off_site(self.site, spot)) is not None:
+            which = {"x": _Y, "y": _X, "z": _Z}[off.axis]
+            raise UnfitItem(which, f"{what}: ({spot.x:g}, {spot.y:g}) {off.why}")
+        for box in self.site.forbidden:
+            if inside(box, spot.x, spot.y):
+                raise UnfitItem(DENIED, f"{what}: it lies in {box.name}, which is forbidden")
+        for box in self.site.obstacles:
+            if inside(box, spot.x, spot.y):
+                raise UnfitItem(DENIED, f"{what}: it lies inside {box.name}, an obstacle")
+        return f"({spot.x:.1f}, {spot.y:.1f}, {spot.z:.1f})"
+
+    def check_circle(self, number: int, item: Item, radius_m: float) -> None:
+        """Raise UnfitItem for a circle around an item's position that leaves the site."""
+        x, y, _ = to_site(self.site, item.x / 1e7, item.y / 1e7, 0.0)
+        for east, north in ((radius_m, 0.0), (0.0, radius_m), (-radius_m, 0.0), (0.0, -radius_m)):
+            # To decimetres, as the plan says its middle.
+            edge = Place(x=round(x, 1) + east, y=round(y, 1) + north)
+            if (off := off_site(self.site, edge)) is not None:
+                raise UnfitItem(_FIRST_PARAM + 2, f"item {number}: a circle of {radius_m:g} m {off.why}")
+
+    def height(self, number: int, item: Item, low: float = 0.0) -> float:
+        """Return an item's height over the site's ground, metres, at least `low`; UnfitItem when there is none."""
         if item.frame not in _GLOBAL | _RELATIVE:
             name = label("MAV_FRAME", item.frame).removeprefix("MAV_FRAME_")
-            raise UnfitItem(UNSUPPORTED_FRAME, f"{what}: frame {name} is not supported, use GLOBAL_RELATIVE_ALT")
+            raise UnfitItem(UNSUPPORTED_FRAME, f"item {number}: frame {name} is not supported, use GLOBAL_RELATIVE_ALT")
         if item.z is None:
-            raise UnfitItem(_FIRST_PARAM + 6, f"{what}: no altitude")
-        x, y, z = to_site(self._site, item.x / 1e7, item.y / 1e7, item.z)
-        if item.frame in _RELATIVE:
-            z = item.z
-        if abs(item.x) > 90 * 10**7 or max(abs(x), abs(y)) > MAX_EXTENT_M:
-            raise UnfitItem(_FIRST_PARAM + 4, f"{what}: more than {MAX_EXTENT_M / 1e3:g} km from the site")
-        if z > self._site.altitude_limit_m:
-            raise UnfitItem(
-                _FIRST_PARAM + 6, f"{what}: {z:g} m is above the site's limit of {self._site.altitude_limit_m:g} m"
-            )
-        for box in self._site.forbidden:
-            if inside(box, x, y):
-                raise UnfitItem(DENIED, f"{what}: it lies in {box.name}, which is forbidden")
-        return f"({x:.1f}, {y:.1f}, {max(0.0, z):.1f})"  # satellites are no better
+            raise UnfitItem(_Z, f"item {number}: no altitude")
+        z = round(item.z if item.frame in _RELATIVE else item.z - self.site.altitude_m, 1)
+        if -DATUM_M <= z < 0:
+            z = 0.0
+        if why := off_height(self.site, z):
+            raise UnfitItem(_Z, f"item {number}: it {why}")
+        if z < low:
+            raise UnfitItem(_Z, f"item {number}: {z:g} m is too low, use at least {low:g} m")
+        return z
+
+
+def _fitting(way: Sequence[str]) -> int:
+    """Return how many places of a way fit one subtask's text, at least one."""
+    size = count = 0
+    for place in way:
+        size += len(place) + 2
+        if count and size > MAX_PATH:
+            break
+        count += 1
+    return count
 
 
 def plan_of(items: Sequence[Item], *, robot: str, site: Site, first: int = 0, last: int | None = None) -> Plan:
@@ -165,18 +216,19 @@ def _take(maker: _Maker, number: int, item: Item) -> None:
     if item.command in _SOMEWHERE:
         _go(maker, number, item)
     elif item.command == _TAKEOFF:
-        altitude = _number(number, item, 7, low=0.5, high=1000.0)
-        maker.add("takeoff", altitude_m=round(altitude, 2))
+        maker.add("takeoff", altitude_m=maker.height(number, item, low=0.5))
     elif item.command == _LAND:
-        if item.x or item.y:
-            maker.pass_by(maker.place(number, item))
+        if (item.x or item.y) and _UNSET not in (item.x, item.y):
+            # NaN is the ground, wherever that is.
+            ground = item if item.z is not None else replace(item, frame=min(_RELATIVE), z=0.0)
+            maker.pass_by(maker.place(number, ground))
         maker.add("land")
     elif item.command == _RETURN:
         maker.add("return_home")
     elif item.command in (_DELAY, _WAIT):
-        maker.add("hold", duration_s=_number(number, item, 1, low=0.0, high=MAX_HOLD_S))
+        maker.hold(_number(number, item, 1, low=0.0, high=MAX_HOLD_S))
     elif item.command == _SPEED:
-        maker.speed = _number(number, item, 2, low=0.1, high=100.0)
+        maker.speed = _number(number, item, 2, low=0.1, high=maker.site.speed_limit_mps)
     elif item.command == _PICTURE:
         if not maker.here:
             raise UnfitItem(UNSUPPORTED, f"item {number}: a picture needs a waypoint before it")
@@ -191,16 +243,17 @@ def _go(maker: _Maker, number: int, item: Item) -> None:
     place = maker.place(number, item)
     if item.command == _LOITER_TURNS:
         laps = max(1, round(_number(number, item, 1, low=0.0, high=MAX_LAPS, usual=1.0)))
-        radius = abs(_number(number, item, 3, low=-100.0, high=100.0, usual=2.0)) or 2.0
+        radius = max(0.5, abs(_number(number, item, 3, low=-100.0, high=100.0, usual=2.0)) or 2.0)
+        maker.check_circle(number, item, radius)
         maker.here = place
-        maker.add("orbit", target=place, laps=laps, radius_m=max(0.5, radius))
+        maker.add("orbit", target=place, laps=laps, radius_m=radius)
         return
     maker.pass_by(place)
     hold_s = 0.0
     if item.command != _LOITER:
         hold_s = _number(number, item, 1, low=0.0, high=MAX_HOLD_S, usual=0.0)
     if item.command != _WAYPOINT or hold_s > 0:
-        maker.add("hold", **({"duration_s": hold_s} if hold_s > 0 else {}))
+        maker.hold(hold_s)
 
 
 def _number(number: int, item: Item, place: int, *, low: float, high: float, usual: float | None = None) -> float:

@@ -95,7 +95,14 @@ class Switch:
             refused=refused,
             busy=lambda: session.unsent > _BUSY,
         )
-        self._missions = MissionDesk(config, site=site, store=store, refused=refused, clock=time.monotonic)
+        self._missions = MissionDesk(
+            config,
+            site=site,
+            store=store,
+            refused=refused,
+            clock=time.monotonic,
+            problems=(lambda _: ()) if tasks is None else tasks.problems,
+        )
         self._requests = RequestDesk(
             config.templates,
             tasks=tasks,

@@ -12,13 +12,14 @@ import math
 import secrets
 import time
 from contextlib import AsyncExitStack
+from typing import NoReturn
 
 import msgspec
 import structlog
 from msgspec import Struct, field
 
-from appliance.errors import ConfigError, UnreachableError
-from appliance.model import Notice, Pose, RobotInfo, Site, encode
+from appliance.errors import ConfigError, ConflictError, UnreachableError
+from appliance.model import Notice, Pose, RobotCommand, RobotInfo, Site, encode
 from appliance.model.geo import blocked_leg
 from appliance.plane.keys import check_name
 from appliance.plane.session import Session
@@ -59,6 +60,8 @@ USUAL_RECORD_S, USUAL_FPS = 5.0, 5.0
 _RETRY_S = 0.5
 _SEEN_S = 5.0
 """How often a robot whose name is taken shows that it is there."""
+_SETTLE_S = 0.8
+"""How long a robot shows itself before it takes commands: four states, in which another of its name is heard."""
 _OPERATOR = "operator"
 _SNAPSHOT_S = 1.0
 _MAX_HOLD_S = 86_400.0
@@ -89,7 +92,11 @@ class RobotSettings(Struct, frozen=True, kw_only=True):
 
 
 async def run_robot(settings: RobotSettings, *, stop: asyncio.Event | None = None) -> None:
-    """Simulate until `stop` is set or the task is cancelled; waits for a gateway as long as there is none."""
+    """Simulate until `stop` is set or the task is cancelled; waits for a gateway as long as there is none.
+
+    Raises:
+        ConflictError: another robot of its name started at the same time, and is older.
+    """
     settings.check()
     stop = asyncio.Event() if stop is None else stop
     session = await _connect(settings, stop)
@@ -126,6 +133,8 @@ class Rover:
         self.driving = Driving(*self.home, battery_percent=settings.battery_percent)
         self.refused: dict[str, int] = {}
         self._speaker = f"{time.time_ns():020d}-{secrets.token_hex(4)}"
+        self._older = ""
+        """Another robot of this name that was heard and started earlier."""
         self._site = settings.site
         self._rate = settings.rate
         self._session = session
@@ -163,6 +172,7 @@ class Rover:
         async with AsyncExitStack() as stack:
             follow = session.subscribe_typed(keys.world(), Thing, self._follow)
             stack.callback(follow.close)
+            stack.callback(session.subscribe_typed(keys.robot(self.name), RobotInfo, self._meet).close)
             await self._catch_up()
             if not await self._named_alone(stop):
                 return
@@ -180,19 +190,26 @@ class Rover:
             await self._live(stop)
 
     async def _named_alone(self, stop: asyncio.Event) -> bool:
-        """Wait until no other robot has this one's name, which is reported once; False when it is to stop first."""
+        """Wait until no other robot has this one's name; False when it is to stop first.
+
+        Raises:
+            ConflictError: one that started at the same instant is older.
+        """
+        while await self._until_free(stop):
+            # One that started at the same instant holds no token yet: both show themselves first.
+            await self._settle(stop)
+            if not await self._session.alive_now(self._session.keys.robot_alive(self.name)):
+                return not stop.is_set()
+        return False
+
+    async def _until_free(self, stop: asyncio.Event) -> bool:
+        """Wait until no robot holds the token of this name, which is reported once; False when it is to stop first."""
         session, reported, seen_at = self._session, False, -math.inf
         while await session.alive_now(session.keys.robot_alive(self.name)):
             if not reported:
                 reported = True
                 log.error("another robot has this name: waiting until it is gone", robot=self.name)
-                notice = Notice(
-                    id=f"{self.name}/namesake/{self._speaker}",
-                    to=_OPERATOR,
-                    text=f"a second robot that calls itself {self.name} is refused: give it a name of its own",
-                    at_ns=time.time_ns(),
-                )
-                session.put(session.keys.notice(_OPERATOR), encode(notice))
+                self._report_namesake()
             if time.monotonic() - seen_at >= _SEEN_S:
                 seen_at = time.monotonic()
                 session.put(session.keys.robot(self.name), encode(self.info()))  # heeded by no roster, but seen
@@ -202,9 +219,50 @@ class Rover:
                     return False
         return True
 
+    def _report_namesake(self) -> None:
+        notice = Notice(
+            id=f"{self.name}/namesake/{self._speaker}",
+            to=_OPERATOR,
+            text=f"a second robot that calls itself {self.name} is refused: give it a name of its own",
+            at_ns=time.time_ns(),
+        )
+        self._session.put(self._session.keys.notice(_OPERATOR), encode(notice))
+
+    def _meet(self, key: str, info: RobotInfo | None) -> None:
+        """Hear the states under this name: of two that started at the same instant the older has it, as in rosters."""
+        del key
+        if info is not None and info.speaker and info.speaker < self._speaker:
+            self._older = info.speaker
+
+    async def _settle(self, stop: asyncio.Event) -> None:
+        """Show itself for a moment; ConflictError when an older one does so, too."""
+        self._older = ""  # of those that have gone
+        until = time.monotonic() + _SETTLE_S
+        while time.monotonic() < until and not stop.is_set():
+            self._session.put(self._session.keys.robot(self.name), encode(self.info()))
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(STATE_S):
+                    await stop.wait()
+            if self._older:
+                self._yield_name()
+
+    def _yield_name(self) -> NoReturn:
+        self._report_namesake()
+        raise ConflictError(
+            f"another robot is called {self.name}, and started earlier ({self._older}, this one {self._speaker})",
+            remedy="give each a name of its own",
+        )
+
     async def _live(self, stop: asyncio.Event) -> None:
         before = told = 0.0
         while not stop.is_set():
+            if self._older:
+                # A log that is played tells of older ones, too: what counts is one that takes commands.
+                asked = encode(RobotCommand(id=f"{self.name}/who", verb="state"))
+                key = self._session.keys.command(self.name)
+                if await self._session.answerers(key, asked, timeout_s=_SNAPSHOT_S) > 1:
+                    self._yield_name()
+                self._older = ""
             now = time.monotonic()
             dt = min(now - before, _LATE_S) * self._rate if before else 0.0
             before = now

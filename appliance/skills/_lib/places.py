@@ -4,13 +4,9 @@ import math
 import re
 from typing import Any, NamedTuple
 
-from . import params
+from . import coordinates, params
 from .context import Context
 
-_NUMBER = r"[-+]?\d+(?:\.\d+)?"
-_COORDINATE = re.compile(
-    rf"\(?\s*x?\s*=?\s*({_NUMBER})\s*[,;]\s*y?\s*=?\s*({_NUMBER})(?:\s*[,;]\s*z?\s*=?\s*({_NUMBER}))?\s*\)?"
-)
 _SPLIT = re.compile(r"\s*(?:[,;]|->|→|\band then\b|\bthen\b|\band\b|\bvia\b|\bto\b|\bfrom\b)\s*")
 _FAR_M = 200.0
 """A coordinate further than this outside the mapped area is taken for a mistake."""
@@ -33,9 +29,9 @@ def plain(name: str) -> str:
 
 def resolve(ctx: Context, name: str) -> Spot:
     """Return where a place or coordinate is; ctx.Fail with the known places when the site has no such place."""
-    match = _COORDINATE.fullmatch(name.strip())
-    if match:
-        x, y, z = (float(each or 0.0) for each in match.groups())
+    point = coordinates.read(name)
+    if point is not None:
+        x, y, z = point
         _check_within(ctx, name, x, y)
         return Spot(f"({x:g}, {y:g})", x, y, z)
     places = params.table(ctx.site.get("places"))

@@ -20,6 +20,7 @@ class FakeSession:
         self.puts: list[tuple[str, bytes]] = []
         self.queries: list[bytes] = []
         self.answer: Callable[[bytes], Awaitable[bytes]] | None = None
+        self.alive = False
 
     def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:  # noqa: ARG002
         """Keep a put."""
@@ -31,6 +32,10 @@ class FakeSession:
         if self.answer is None:
             raise UnreachableError(f"nobody answers {key}")
         return await self.answer(payload)
+
+    async def alive_now(self, expr: str) -> list[str]:
+        """The key, where a token is there."""
+        return [expr] if self.alive else []
 
     def commanded(self) -> list[RobotCommand]:
         """Return the commands that were announced as taken up."""

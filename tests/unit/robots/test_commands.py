@@ -2,17 +2,19 @@
 
 import asyncio
 import contextlib
+import itertools
 from typing import Any
 
 import msgspec
 import pytest
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, PayloadError, RobotError, UnreachableError
+from appliance.errors import ContractError, DeadlineError, PayloadError, RobotError, UnreachableError
 from appliance.model import Failure, RobotCommand, RobotReply, encode
-from appliance.robots import commands as module
-from appliance.robots.commands import CommandDesk, Done, Verb, send_command
+from appliance.robots import patience
+from appliance.robots.commands import CommandDesk, Done, Verb
 from appliance.robots.ledger import Ledger
+from appliance.robots.sending import send_command
 from appliance.robots.verbs import RobotFailure
 
 pytestmark = pytest.mark.anyio
@@ -300,7 +302,7 @@ async def test_lost_replies_and_restarts_are_asked_again(session: Any) -> None:
 
 async def test_nobody_answers(session: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot that nobody serves is UnreachableError with the remedy, well before a long deadline."""
-    monkeypatch.setattr(module, "UNREACHABLE_S", 0.3)
+    monkeypatch.setattr(patience, "UNREACHABLE_S", 0.3)
     with pytest.raises(UnreachableError, match="swiftbot robots"):
         await send_command(session, "r", order("t/s1/1"), timeout_s=60.0)
 
@@ -344,3 +346,48 @@ async def test_giving_up_stops_the_robot(session: Any, how: str) -> None:
         with pytest.raises(DeadlineError):
             await task
     await seen.wait()
+
+
+async def test_a_robot_that_is_there_and_does_not_answer_breaks_the_contract(
+    session: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error says which robot, which verb, how long and how often; it is told to stop, and has a check."""
+    monkeypatch.setattr(patience, "UNREACHABLE_S", 0.5)
+    session.alive = True
+    with pytest.raises(ContractError, match=r"robot r did not answer goto for \d s \(asked \d times\)") as caught:
+        await send_command(session, "r", order("t/s1/1"), timeout_s=60.0)
+    assert "swiftbot robots check r" in caught.value.remedy
+    await asyncio.sleep(0)
+    last = msgspec.json.decode(session.queries[-1], type=RobotCommand)
+    assert (last.verb, last.args) == ("stop", {"id": "t/s1/1"})
+
+
+async def test_a_reply_to_another_command_is_none(session: Any) -> None:
+    """A robot that mixes its replies up is not believed."""
+
+    async def answer(payload: bytes) -> bytes:
+        return encode(RobotReply(id="t/s1/7"))
+
+    session.answer = answer
+    with pytest.raises(ContractError, match="a reply to 't/s1/7'"):
+        await send_command(session, "r", order("t/s1/1"), timeout_s=1.0)
+
+
+async def test_a_robot_that_does_again_what_it_has_done_is_told_so(
+    session: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its second answer differs from the first: each question was carried out."""
+    monkeypatch.setattr(patience, "FIRST_SILENCE_S", 0.1)
+    free, done = asyncio.Lock(), itertools.count()
+
+    async def answer(payload: bytes) -> bytes:
+        command = msgspec.json.decode(payload, type=RobotCommand)
+        if command.verb == "stop":
+            return encode(RobotReply(id=command.id))
+        async with free:  # one after the other, each as if it was new
+            await asyncio.sleep(0.15)
+            return encode(RobotReply(id=command.id, result={"turn": next(done)}))
+
+    session.answer = answer
+    with pytest.raises(ContractError, match="keeps no replies by command id"):
+        await send_command(session, "r", order("t/s1/1"), timeout_s=60.0)

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.errors import PayloadError
-from appliance.model import Box, Place, Site, TaskRecord, TaskRequest, TaskState
+from appliance.llm.checks.schema import validate
+from appliance.model import Box, Place, Plan, Site, TaskRecord, TaskRequest, TaskState
 from appliance.model.geo import to_globe
 from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
@@ -18,6 +20,7 @@ from appliance.robots.mavlink.mission_desk import MissionDesk
 from appliance.robots.mavlink.mission_plan import Item, UnfitItem, plan_of
 from appliance.robots.mavlink.requests import RequestDesk
 from appliance.robots.settings import RobotsConfig
+from appliance.skills.catalogue import load_catalogue
 from tests.unit.robots.conftest import FakeStore
 
 pytestmark = pytest.mark.anyio
@@ -26,9 +29,13 @@ SITE = Site(
     places={"home": Place(x=4.0, y=4.0)},
     altitude_limit_m=30.0,
     forbidden=(Box(name="the pond", x=(40.0, 50.0), y=(40.0, 50.0)),),
+    obstacles=(Box(name="the shed", x=(52.0, 56.0), y=(40.0, 50.0)),),
+    fence=Box(name="the fence", x=(0.0, 60.0), y=(0.0, 60.0)),
+    altitude_m=488.0,
 )
 ACCEPTED, DENIED, UNSUPPORTED, NO_SPACE, INVALID_SEQUENCE, CANCELLED = 0, 14, 3, 4, 13, 15
 WAYPOINT, TAKEOFF, LAND, RETURN, TURNS, PICTURE, SPEED, JUMP = 16, 22, 21, 20, 18, 2000, 178, 177
+LOITER_TIME, DELAY = 19, 93
 
 
 def item(command: int, x: float = 0.0, y: float = 0.0, z: float = 8.0, *params: float, frame: int = 6) -> Item:
@@ -88,7 +95,14 @@ class Ground:
         """Send an item."""
         each = items[number]
         params = {f"param{place + 1}": math.nan if value is None else value for place, value in enumerate(each.params)}
-        fields = {"frame": each.frame, "command": each.command, "x": each.x, "y": each.y, "z": each.z, **params}
+        fields = {
+            "frame": each.frame,
+            "command": each.command,
+            "x": each.x,
+            "y": each.y,
+            "z": math.nan if each.z is None else each.z,
+            **params,
+        }
         self.tell("MISSION_ITEM_INT", seq=number, current=0, autocontinue=1, **fields)
 
     async def upload(self, items: list[Item]) -> int:
@@ -149,11 +163,23 @@ async def test_what_a_mission_means() -> None:
     [
         (item(JUMP), UNSUPPORTED, "DO_JUMP is not supported"),
         (item(WAYPOINT, 10, 4, frame=1), 2, "LOCAL_NED is not supported"),
-        (item(WAYPOINT, 30_000, 4), 10, "10 km"),
+        (item(WAYPOINT, 30_000, 4), 11, "10 km"),
+        (item(WAYPOINT, 500, 4), 11, "outside the fence"),
+        (item(WAYPOINT, 10, -500), 10, "outside the fence"),
+        (item(WAYPOINT, 10, 4, -5.0), 12, "5 m under the ground"),
+        (item(WAYPOINT, 10, 4, 480.0, frame=0), 12, "8 m under the ground"),
+        (item(LAND, 61, 4, 0.0), 11, "outside the fence"),
+        (item(LOITER_TIME, 10, 4, 31.0, 5.0), 12, "limit of 30 m"),
+        (item(TURNS, 10, 10, 8.0, 1.0, 0.0, 12.0), 8, "a circle of 12 m lies outside the fence"),
+        (item(WAYPOINT, 54, 45), DENIED, "inside the shed"),
+        (item(SPEED, 0, 0, 0, 0.0, 9.0), 7, "param2"),
+        (item(TAKEOFF, z=40.0), 12, "limit of 30 m"),
+        (item(TAKEOFF, z=550.0, frame=0), 12, "62 m up"),
         (item(WAYPOINT, 10, 4, 80.0), 12, "limit of 30 m"),
         (item(WAYPOINT, 45, 45), DENIED, "the pond"),
         (item(WAYPOINT, 10, 4, 8.0, 1e9), 6, "param1"),
-        (item(TAKEOFF, z=-3.0), 12, "param7"),
+        (item(TAKEOFF, z=-3.0), 12, "3 m under the ground"),
+        (item(TAKEOFF, z=0.2), 12, "too low"),
         (Item(command=WAYPOINT, frame=6, z=None), 12, "no altitude"),
     ],
 )
@@ -168,6 +194,50 @@ async def test_what_cannot_be_flown(store: FakeStore, bad: Item, result: int, to
     with pytest.raises(UnfitItem, match=told.replace("(", ".")) as caught:
         plan_of([*MISSION[:2], bad], robot="drone_1", site=SITE)
     assert caught.value.result == result
+
+
+CATALOGUE = load_catalogue()
+
+
+@pytest.mark.parametrize(
+    "items",
+    [
+        [item(TAKEOFF), item(WAYPOINT, 10, 10)],
+        [item(TAKEOFF), item(WAYPOINT, 10, 10, 8.0, 5.0)],
+        [item(TAKEOFF), item(LOITER_TIME, 10, 10, 8.0, 5.0)],
+        [item(TAKEOFF), item(LAND, 10, 10, 0.0)],
+        [item(TAKEOFF), replace(item(LAND, 10, 10, 0.0), z=None)],
+        [item(TAKEOFF, z=498.0, frame=0), item(WAYPOINT, 10, 10, 498.0, frame=0)],
+        [item(TAKEOFF), item(WAYPOINT, 10, 10, -0.5), item(DELAY, 0, 0, 0, 0.0)],
+        [item(WAYPOINT, number % 60, number // 5, 10) for number in range(200)],
+    ],
+)
+async def test_what_is_accepted_may_run(store: FakeStore, items: list[Item]) -> None:
+    """The plan of a mission that was accepted has no problem: the same check looks at both."""
+    site = replace(SITE, obstacles=(), forbidden=())
+    ground = Ground(store)
+    ground.desk = MissionDesk(
+        RobotsConfig(), site=site, store=store, refused=ground.refused, clock=lambda: ground.now, problems=problems
+    )
+    assert await ground.upload(items) == ACCEPTED, ground.texts
+    _, plan = ground.desk.request("drone_1", (0.0,) * 7)
+    assert problems(plan) == ()
+
+
+async def test_what_would_not_run_is_refused_with_the_reason_of_its_plan(store: FakeStore) -> None:
+    """Whatever the check of plans has against a mission is said when it is uploaded, and nothing is held."""
+    ground = Ground(store)
+    ground.desk = MissionDesk(
+        RobotsConfig(), site=SITE, store=store, refused=ground.refused, clock=lambda: ground.now, problems=problems
+    )
+    assert await ground.upload([item(WAYPOINT, 1 + number % 30, 4, 8.0, 1.0) for number in range(40)]) == DENIED
+    assert "at most 64" in "".join(ground.texts)
+    assert not store.values
+
+
+def problems(plan: Plan) -> tuple[str, ...]:
+    """What the check of plans has against one."""
+    return validate(plan, CATALOGUE, site=replace(SITE, obstacles=(), forbidden=()), require_implemented=True)
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -31,7 +31,7 @@ def test_three_numbers_are_a_point_with_a_height(text: str) -> None:
 @given(
     st.floats(-500, 500).map(lambda each: round(each, 2)),
     st.floats(-500, 500).map(lambda each: round(each, 2)),
-    st.sampled_from(["{x}, {y}", "({x}, {y})", "x={x}, y={y}", "{x}; {y}", "({x}, {y}, 3)"]),
+    st.sampled_from(["{x}, {y}", "({x}, {y})", "x={x}, y={y}", "{x}; {y}", "({x}, {y}, 3)", "{x} {y}", "{x} m, {y} m"]),
 )
 def test_plans_and_skills_read_the_same_point(x: float, y: float, form: str) -> None:
     """What the check lets pass is where the robot goes."""
@@ -59,6 +59,14 @@ def test_a_place_where_nobody_may_go_is_refused_with_the_reason(place: str, why:
     """Before anything moves."""
     (problem,) = going(place)
     assert why in problem
+
+
+def test_metres_that_happen_to_be_near_the_degrees_of_the_site_are_metres() -> None:
+    """On a large site (47, 8.5) is a point like any other; with the decimals of degrees it is a mistake."""
+    large = replace(SITE, fence=None, obstacles=(), forbidden=())
+    for text, problems in (("(47.0, 8.5, 10.0)", 0), ("47.4, 8.5", 0), ("47.39, 8.55", 1), ("8.5457, 47.3979", 1)):
+        subtask = Subtask(id="s1", skill="goto", robot="r", params={"place": text})
+        assert len(tuple(place_problems(subtask, large))) == problems, text
 
 
 def test_without_a_fence_only_what_is_far_is_outside() -> None:
