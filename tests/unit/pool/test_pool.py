@@ -216,6 +216,40 @@ async def test_bad_runs_end_with_one_failure(bench: Any, do: str, code: str) -> 
     assert final.kind is RunEventKind.SUCCEEDED
 
 
+@pytest.mark.parametrize(
+    ("result", "told"),
+    [
+        (None, "output 'number' is missing: expected a number, got a result with nothing in it"),
+        ({"findings": []}, "output 'number' is missing: expected a number, got a result with 'findings'"),
+        ({"number": None, "findings": 1}, "output 'number' is missing: expected a number, got null"),
+        ({"number": "3", "findings": 1}, "output 'number' has the wrong type: expected a number, got the text '3'"),
+        ({"number": True, "findings": 1}, "expected a number, got true"),
+        ({"number": 3}, "output 'findings' is missing: expected a value"),
+        ({"number": 3, "findings": 1, "count": 1.5}, "output 'count' has the wrong type: expected a whole number"),
+    ],
+)
+async def test_a_result_that_is_not_what_the_manifest_promises_fails_its_run(
+    bench: Any, result: Any, told: str
+) -> None:
+    """It names skill, output, what is expected and what came; it is counted, and not tried again."""
+    pool = await bench.pool()
+    final, _ = await bench.run(pool, bench.request(1, skill="promising", result=result))
+    assert final.kind is RunEventKind.FAILED
+    assert (final.failure.code, final.failure.retryable) == ("payload", False)
+    assert final.failure.message.startswith("the result of promising is not what its manifest promises: ")
+    assert told in final.failure.message
+    assert "skill.toml" in final.failure.remedy
+    assert pool.refused["result"] == 1
+
+
+@pytest.mark.parametrize("more", [{}, {"count": 3}, {"count": 3.0}, {"count": None}, {"other": "x"}])
+async def test_a_result_may_hold_more_than_its_manifest_promises(bench: Any, more: dict[str, Any]) -> None:
+    """What is promised is there, what is optional may be left out, and nothing else is looked at."""
+    result = {"number": 2.5, "findings": ["x"], **more}
+    final, _ = await bench.run(await bench.pool(), bench.request(1, skill="promising", result=result))
+    assert (final.kind, final.result) == (RunEventKind.SUCCEEDED, result)
+
+
 async def test_cancel(bench: Any, tmp_path: Path) -> None:
     """A run can be cancelled while it runs and while it waits; one that is not there is not."""
     pool = await bench.pool(capacity=1)
