@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from appliance.errors import DeadlineError, PayloadError, PoolError, RobotError, SwiftbotError, UnreachableError
 from appliance.model import Failure, Phase, RunEvent, RunEventKind, RunRequest
-from appliance.pool.container import Connection, Frame
+from appliance.pool.container import Connection, Ending, Frame
 
 log = structlog.get_logger(__name__)
 
@@ -93,8 +93,10 @@ class Conversation:
         on_event: Callable[[RunEvent], None],
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         refused: Counter[str],
+        ending: Callable[[], Awaitable[Ending]],
     ) -> None:
         self._connection = connection
+        self._ending = ending
         self._request = request
         self._where = {"gateway": gateway, "container": container, "phase": phase}
         self._entered_ns = entered_ns
@@ -145,9 +147,8 @@ class Conversation:
             self._flush()
             for call in self._calls:
                 call.cancel()
-        return self.failed(
-            "pool", "the container died in mid-run", remedy="it is replaced; the gateway's log tells what became of it"
-        )
+        ending = await self._ending()
+        return self.failed(ending.code, ending.message, remedy=ending.remedy)
 
     async def _pace(self) -> None:
         """Let a run that floods its gateway wait."""

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Need, Phase, RunEvent, RunEventKind, RunRequest
-from appliance.pool.container import Connection
+from appliance.pool.container import LOST, Connection, Ending
 from appliance.pool.conversation import Call, Conversation
 
 KINDS = ("started", "progress", "log", "alive", "partial", "checkpoint", "call", "result", "error")
@@ -55,7 +55,12 @@ class Listener:
         """Never full."""
 
 
-async def converse(bodies: list[bytes]) -> tuple[RunEvent, list[RunEvent]]:
+async def lost() -> Ending:
+    """Nobody knows how the container ended."""
+    return LOST
+
+
+async def converse(bodies: list[bytes], refused: Counter[str] | None = None) -> tuple[RunEvent, list[RunEvent]]:
     """Have a run say this; returns its last event and those before."""
     reader = asyncio.StreamReader()
     for body in bodies:
@@ -75,7 +80,8 @@ async def converse(bodies: list[bytes]) -> tuple[RunEvent, list[RunEvent]]:
         entered_ns=ENTERED_NS,
         on_event=events.append,
         on_call=answer,
-        refused=Counter(),
+        refused=refused if refused is not None else Counter(),
+        ending=lost,
     )
     return await conversation.listen(), events
 
