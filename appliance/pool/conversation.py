@@ -78,6 +78,28 @@ def _table(value: Any) -> dict[str, Any]:
     return cast("dict[str, Any]", value) if isinstance(value, dict) else {}
 
 
+_NAMES: dict[type, str] = {dict: "a table", float: "a number"}
+
+
+def _named(value: object) -> str:
+    """Return what a value is, in words."""
+    match value:
+        case None:
+            return "nothing"
+        case bool():
+            return "true or false"
+        case int() | float():
+            return "a number"
+        case str() | bytes():
+            return "a text" if isinstance(value, str) else "bytes"
+        case list():
+            return "a list"
+        case dict():
+            return "a table"
+        case _:
+            return f"a {type(value).__name__}"
+
+
 class Conversation:
     """Listens to one run to its end."""
 
@@ -181,14 +203,18 @@ class Conversation:
             case "alive":
                 self._tell(self.event(RunEventKind.ALIVE))
             case "partial":
-                self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
+                if self._fits("partial result", frame.get("result"), dict):
+                    self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
-                calls = int(_number(frame.get("calls")))
-                self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
+                if self._fits("checkpoint", frame.get("data"), dict):
+                    calls = int(_number(frame.get("calls")))
+                    self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
             case "call":
                 await self._call(frame)
             case "result":
                 self._note_usage(frame)
+                if not isinstance(frame.get("result"), dict):
+                    return self._no_result(frame.get("result"))
                 return self.event(
                     RunEventKind.SUCCEEDED,
                     result=_table(frame.get("result")),
@@ -202,7 +228,23 @@ class Conversation:
                 raise PayloadError(f"the runner sent an unknown event {str(other)[:40]!r}")
         return None
 
+    def _fits(self, what: str, value: object, *kinds: type) -> bool:
+        """Whether news is of the type it should be; what is not is counted, left out, and told in the run's lines."""
+        if isinstance(value, kinds) and not isinstance(value, bool):
+            return True
+        self._refused["run news"] += 1
+        self._line({"text": f"a {what} was left out: it is {_named(value)}, not {_NAMES[kinds[0]]}"})
+        return False
+
+    def _no_result(self, value: object) -> RunEvent:
+        """Return the end of a run whose result is no table: what it did is not known."""
+        self._refused["result"] += 1
+        text = f"the result of {self._request.skill} is {_named(value)}, not a table"
+        return self.failed("payload", text, remedy="return a dict from run(ctx)", retryable=False)
+
     def _progress(self, frame: Frame) -> None:
+        if not self._fits("progress", frame.get("fraction", 0.0), float, int):
+            return
         fraction, note = _number(frame.get("fraction")), str(frame.get("note", ""))
         self._tell(self.event(RunEventKind.PROGRESS, progress=fraction, note=note))
 
@@ -248,8 +290,8 @@ class Conversation:
         for line in cast("list[object]", trace) if isinstance(trace, list) else ():
             self._line({"text": str(line)})
         return self.failed(
-            str(frame.get("code", "internal")),
-            str(frame.get("message", "")),
+            str(frame.get("code") or "internal"),
+            str(frame.get("message") or "the handler failed and gave no reason"),
             remedy=str(frame.get("remedy", "")),
             retryable=bool(frame.get("retryable", False)),
         )
@@ -260,6 +302,11 @@ class Conversation:
             self._refused["call"] += 1
             error = {"code": "refused", "message": f"{MAX_CALLS} calls are in progress already", "retryable": True}
             await self._reply({"n": number, "error": error})
+            return
+        if not isinstance(frame.get("args", {}), dict):
+            self._refused["call"] += 1
+            text = f"the arguments of {str(frame.get('name'))[:40]!r} are {_named(frame.get('args'))}, not a table"
+            await self._reply(self._refusal(number, PayloadError(text), retryable=False))
             return
         call = Call(run=self._request, number=number, name=str(frame.get("name", "")), args=_table(frame.get("args")))
         task = asyncio.create_task(self._carry_out(call), name=f"call {self._request.run_id}/{number}")

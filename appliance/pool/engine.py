@@ -144,6 +144,10 @@ class Engine(Protocol):
         """Return when the engine answers; UnreachableError when it does not within `timeout_s`."""
         ...
 
+    def hang_up(self) -> None:
+        """Ask for no sign of life any more; on the event loop."""
+        ...
+
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return the containers that have all these labels."""
         ...
@@ -191,6 +195,8 @@ class PodmanEngine:
         self.path = socket_path(url)
         self._timeout_s = timeout_s
         self._threads = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="podman")
+        self._line: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        """The connection that signs of life come over."""
         self._local = threading.local()
         self._clients: list[Any] = []
         self.calls: Counter[str] = Counter()
@@ -319,23 +325,34 @@ class PodmanEngine:
         return await self._ask(f"state of {container[:12]}", work)
 
     async def ping(self, timeout_s: float) -> None:
-        """Ask Podman for a sign of life, on a connection of its own: the threads may all wait for it just then."""
+        """Ask Podman for a sign of life, on a connection of its own: the threads may all wait for it just then.
+
+        The connection is kept: Podman logs a warning for each that is closed.
+        """
+        line, self._line = self._line, None
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await asyncio.open_unix_connection(str(self.path))
+                reader, writer = line or await asyncio.open_unix_connection(str(self.path))
                 try:
-                    writer.write(b"GET /_ping HTTP/1.1\r\nHost: d\r\nConnection: close\r\n\r\n")
-                    if not await reader.readline():
-                        raise ConnectionResetError
+                    writer.write(b"HEAD /_ping HTTP/1.1\r\nHost: d\r\n\r\n")
+                    await reader.readuntil(b"\r\n\r\n")
+                    self._line = (reader, writer)
                 finally:
-                    writer.close()
+                    if self._line is None:
+                        writer.close()
         except TimeoutError as error:
             raise UnreachableError(
                 f"Podman has not answered within {timeout_s:g} s at its API socket {self.path}",
                 remedy="systemctl --user restart podman.service, as the service user; containers that run serve on",
             ) from error
-        except (OSError, ValueError) as error:
+        except (OSError, EOFError, ValueError, asyncio.LimitOverrunError) as error:
             raise self._unreachable(error) from error
+
+    def hang_up(self) -> None:
+        """Close the connection that signs of life come over; on the event loop."""
+        if self._line is not None:
+            self._line[1].close()
+            self._line = None
 
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return the containers, running or not, that have all these labels."""

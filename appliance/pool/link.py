@@ -109,6 +109,7 @@ class EngineLink:
         """Let go of threads and connections."""
         engine, self.engine = self.engine, None
         if engine is not None:
+            engine.hang_up()
             await asyncio.to_thread(engine.close)
 
     def there(self) -> tuple[Engine, EngineFacts]:

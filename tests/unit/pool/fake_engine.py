@@ -145,6 +145,9 @@ class FakeEngine:
         if self.away or self.silent:
             raise UnreachableError(f"Podman has not answered within {timeout_s:g} s", remedy="restart it")
 
+    def hang_up(self) -> None:
+        """Do nothing."""
+
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return those with the labels."""
         self._called("containers")

@@ -386,3 +386,13 @@ async def test_whoever_has_a_run_is_held_until_its_task_has_ended(manager: TaskM
     plane.session.put(plane.keys.run("t-1", "s1"), encode(event))
     await until(lambda: manager.unfinished == 0)
     assert plane.held == {}
+
+
+async def test_a_cancel_answers_with_the_state_that_came_of_it(manager: TaskManager, plane: Any) -> None:
+    """Not with the one before it: as it is written, in the record that others read as well."""
+    await manager.submit(wish(plane))
+    await until(lambda: manager._drivers["t-1"].record.subtasks)
+    answer = await manager.cancel(CancelTaskAsk(id="t-1", by="ann", why="enough"))
+    assert answer.state is TaskState.CANCELLED
+    assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
+    assert (await manager.cancel(CancelTaskAsk(id="t-1"))).cancelled_by == answer.cancelled_by, "asked again: the same"
