@@ -29,6 +29,8 @@ MAX_LINES = 2000
 """Log lines of one run that are passed on."""
 MAX_FIGURE = 1e12
 """Beyond it a figure of CPU time or memory is none."""
+MOST_CALLS = 10**9
+"""Beyond it the number of calls before a checkpoint is none."""
 MAX_CALLS = 8
 """Calls of one run in progress at once: a handler's threads may each make one."""
 ALIVE_S = 2.0
@@ -78,7 +80,7 @@ def _table(value: Any) -> dict[str, Any]:
     return cast("dict[str, Any]", value) if isinstance(value, dict) else {}
 
 
-_NAMES: dict[type, str] = {dict: "a table", float: "a number"}
+_NAMES: dict[type, str] = {dict: "a table", float: "a number", int: "a whole number"}
 
 
 def _named(value: object) -> str:
@@ -206,9 +208,7 @@ class Conversation:
                 if self._fits("partial result", frame.get("result"), dict):
                     self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
-                if self._fits("checkpoint", frame.get("data"), dict):
-                    calls = int(_number(frame.get("calls")))
-                    self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
+                self._checkpoint(frame)
             case "call":
                 await self._call(frame)
             case "result":
@@ -227,6 +227,17 @@ class Conversation:
             case other:
                 raise PayloadError(f"the runner sent an unknown event {str(other)[:40]!r}")
         return None
+
+    def _checkpoint(self, frame: Frame) -> None:
+        """Pass a checkpoint on; one without a number of calls is none, since the next attempt counts on from it."""
+        calls = frame.get("calls", 0)
+        if not self._fits("checkpoint", frame.get("data"), dict) or not self._fits("checkpoint's calls", calls, int):
+            return
+        if not 0 <= calls <= MOST_CALLS:
+            self._refused["run news"] += 1
+            self._line({"text": "a checkpoint was left out: its number of calls is out of range"})
+            return
+        self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
 
     def _fits(self, what: str, value: object, *kinds: type) -> bool:
         """Whether news is of the type it should be; what is not is counted, left out, and told in the run's lines."""
@@ -275,7 +286,10 @@ class Conversation:
         if self._lines > MAX_LINES:
             self._refused["run output"] += 1
             return
-        fields = _table(frame.get("fields"))
+        given = frame.get("fields")
+        fields = _table(given)
+        if given is not None and not isinstance(given, dict):
+            self._refused["run news"] += 1  # its text is told without them
         self._on_event(self.event(RunEventKind.LOG, note=str(frame.get("text", "")), result=fields or None))
 
     def _note_usage(self, frame: Frame) -> None:
