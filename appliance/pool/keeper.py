@@ -89,7 +89,7 @@ class Keeper:
         self._images = tuple(images)
         self._on_evicted = on_evicted
         self._wake = asyncio.Event()
-        self._starter = make_starter(lambda container: self.retire(container, "it died"))
+        self._starter = make_starter(lambda container: self.retire(container, "it died", died=True))
         self.starts = Starts(
             config, starter=self._starter, link=self.link, decisions=self.decisions, on_end=self._on_started
         )
@@ -261,18 +261,29 @@ class Keeper:
             self._wake.set()
 
     def retire(
-        self, container: PooledContainer, reason: str, *, serve: bool = True, ending: Ending | None = None
+        self,
+        container: PooledContainer,
+        reason: str,
+        *,
+        serve: bool = True,
+        ending: Ending | None = None,
+        died: bool = False,
     ) -> None:
         """Take a container out of the books at once and remove it in the background.
 
-        `ending`: how it ended, for the run in it; Podman is asked when a run is in it and that is not given.
+        Args:
+            container: any of this pool.
+            reason: why, for the pool's decisions.
+            serve: whether those who wait are served at once.
+            ending: how it ended, for the run in it.
+            died: it ended by itself: where a run was in it Podman is asked how, before it is removed.
         """
         run = container.info.run
         if not self.books.drop(container):
             return
         self.decisions.note("retire", image=container.info.image, container=container.id, why=reason)
         container.become(ContainerState.DEAD)
-        ask = bool(run) and ending is None and self.link.engine is not None and not self.link.problem
+        ask = died and bool(run) and self.link.engine is not None and not self.link.problem
         if ending is not None:
             container.tell_ending(ending)
         container.close(told_later=ask)
