@@ -48,9 +48,13 @@ def literal_codes() -> set[str]:
 
 
 def error_classes(root: type[SwiftbotError] = SwiftbotError) -> Iterator[type[SwiftbotError]]:
-    """Return the error tree."""
+    """Return the error tree, as far as it can end a task: what only the command line raises cannot."""
     yield root
     for child in root.__subclasses__():
+        if child.__module__.startswith(("appliance.cli", "appliance.tui")) or not child.__module__.startswith(
+            "appliance"
+        ):
+            continue
         yield from error_classes(child)
 
 
