@@ -38,6 +38,7 @@ from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.check import CheckReport
 from appliance.tasks.replay import ReplayReport
+from appliance.tasks.why import waits_for
 
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
@@ -167,7 +168,9 @@ def plan_answer(answer: PlanAnswer) -> Group:
 
 
 def brief(record: SubtaskRecord) -> str:
-    """A result or failure in a few words."""
+    """A result or failure in a few words; of a subtask that has not ended what it does or waits for goes first."""
+    if record.note and not record.state.final and record.failure is not None:
+        return record.note if record.failure.message in record.note else f"{record.note} ({record.failure.message})"
     if record.failure is not None and record.state is not SubtaskState.SUCCEEDED:
         return record.failure.message
     if record.note and not record.state.final:
@@ -265,7 +268,8 @@ def progress_line(record: SubtaskRecord) -> str:
 def task_list(records: Sequence[TaskRecord]) -> Table:
     """Tasks, a line each."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
-    for name in ("task", "state", "done", "coordinator", "instruction"):
+    waits = {record.id: text for record in records if (text := waits_for(record))}
+    for name in ("task", "state", "done", "coordinator", "instruction", *(["waits for"] if waits else [])):
         table.add_column(name, overflow="fold")
     for record in records:
         done = sum(each.state is SubtaskState.SUCCEEDED for each in record.subtasks)
@@ -275,6 +279,7 @@ def task_list(records: Sequence[TaskRecord]) -> Table:
             f"{done}/{len(record.subtasks)}",
             record.coordinator,
             record.instruction,
+            *([Text(waits.get(record.id, ""), style="yellow")] if waits else []),
         )
     return table
 

@@ -145,9 +145,13 @@ class PlanError(SwiftbotError):
     code = "plan"
     exit_code = Exit.REFUSED
 
-    def __init__(self, message: str, *, remedy: str = "", problems: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, message: str, *, remedy: str = "", problems: tuple[str, ...] = (), oversize: bool = False
+    ) -> None:
         super().__init__(message, remedy=remedy)
         self.problems = problems
+        self.oversize = oversize
+        """Whether the plan would be longer than any may be: no other planner can do better."""
 
 
 class PoolError(SwiftbotError):

@@ -36,6 +36,8 @@ from appliance.model.planner import (
     UpstreamStatus,
 )
 from appliance.model.plans import (
+    MAX_SUBTASKS,
+    SPLIT,
     Finding,
     Plan,
     Provenance,
@@ -44,6 +46,7 @@ from appliance.model.plans import (
     Tier,
     TierAttempt,
     Verdict,
+    oversize,
     plan_hash,
 )
 from appliance.model.requests import (
@@ -108,7 +111,9 @@ from appliance.model.tasks import (
 __all__ = [
     "HIGHEST_PRIORITY",
     "LONGEST_DEADLINE_S",
+    "MAX_SUBTASKS",
     "PLAIN_PRIORITY",
+    "SPLIT",
     "Act",
     "Approval",
     "Attempt",
@@ -177,5 +182,6 @@ __all__ = [
     "Way",
     "Word",
     "encode",
+    "oversize",
     "plan_hash",
 ]
