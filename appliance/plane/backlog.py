@@ -37,7 +37,7 @@ class BacklogAsk(Struct, frozen=True, array_like=True):
     since_ns: int = 0
 
 
-class Said(Struct, frozen=True, array_like=True):
+class Said(Struct, frozen=True, array_like=True, gc=False):
     """A put or delete as it was made; `at_ns` is its Zenoh timestamp."""
 
     number: int
