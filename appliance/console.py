@@ -22,6 +22,7 @@ from appliance.model import (
     ContainerInfo,
     GatewayStatus,
     Plan,
+    RecorderNote,
     RobotInfo,
     SubtaskRecord,
     SubtaskState,
@@ -34,6 +35,7 @@ from appliance.pool.images import ImageState
 from appliance.pool.transfer.api import Brought
 from appliance.reasons import milliseconds
 from appliance.record.facts import LogInfo
+from appliance.record.heard import kinds_text, problem_of, together
 from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.check import CheckReport
@@ -284,6 +286,20 @@ def task_list(records: Sequence[TaskRecord]) -> Table:
     return table
 
 
+def fleet_view(gateways: Sequence[GatewayStatus]) -> Group:
+    """Gateways, a line each, and below them what is wrong with the recorders."""
+    notes = together(note for each in gateways for note in each.recorders)
+    lines = [Text(f"! {text}", style="yellow") for note in notes if (text := recorder_text(note))]
+    return Group(gateway_table(gateways), *lines)
+
+
+def recorder_text(note: RecorderNote) -> str:
+    """What is wrong with a recorder, with a hint; empty when nothing is."""
+    problem = problem_of(note)
+    name = f"recorder {note.id}".removesuffix(" recorder")
+    return f"{name}: {problem} (hint: `swiftbot log info FILE` says when)" if problem else ""
+
+
 def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
     """Gateways, a line each."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
@@ -444,6 +460,11 @@ def log_summary(found: LogInfo) -> Group:
         notes.append(
             Text(f"! {found.not_heard:,} messages never reached the recorder, by their numbers", style="yellow")
         )
+    if found.missed:
+        notes.append(Text(f"! missing by key: {kinds_text(found.missed, most=8)}", style="yellow"))
+    if found.not_received:
+        text = f"{found.not_received:,} frames of vehicles were received by no gateway (link, or the gateway was down)"
+        notes.append(Text(f"· {text}", style="dim"))
     for each in found.incidents:
         at = datetime.fromtimestamp(each.at_ns / 1e9, tz=UTC).isoformat(timespec="milliseconds")
         notes.append(Text(f"incident {at} {each.reason} {each.detail} {each.key}".rstrip(), style="bold red"))

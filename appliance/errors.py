@@ -172,6 +172,16 @@ class ContractError(RobotError):
     code = "contract"
 
 
+class PreconditionError(RobotError):
+    """What is asked cannot be done as things stand: too far away, the hand full or empty, still on the ground.
+
+    The order is at fault and not the robot; a step before it would help.
+    """
+
+    code = "precondition"
+    exit_code = Exit.REFUSED
+
+
 class TakenError(RobotError):
     """A pilot or a failsafe at the vehicle has it: whoever commands it is to wait until it is given back."""
 

@@ -243,13 +243,13 @@ def task_cancel(
 
 
 def fleet(*, as_json: Json = False, where: Where = HERE) -> int:
-    """Show the gateways."""
+    """Show the gateways, and what is wrong with the recorders."""
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             await client.gateway()
             found = sorted(client.plane.registry.gateways.values(), key=lambda each: each.id)
-        show(found, as_json=as_json, table=console.gateway_table(found))
+        show(found, as_json=as_json, table=console.fleet_view(found))
 
     asyncio.run(go())
     return 0

@@ -11,6 +11,7 @@ from appliance.model.gateways import (
     ContainerState,
     GatewayStatus,
     PoolHint,
+    RecorderNote,
     VolumeInfo,
 )
 from appliance.model.messages import (
@@ -149,6 +150,7 @@ __all__ = [
     "Pose",
     "Proposal",
     "Provenance",
+    "RecorderNote",
     "Revision",
     "RevisionKind",
     "RobotCommand",

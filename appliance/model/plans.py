@@ -101,6 +101,8 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Why an operator should agree before it runs; empty: nothing is against it."""
     findings: tuple[Finding, ...] = ()
     """What the review of the plan found, by the name of the check."""
+    edited: bool = False
+    """Whether an operator changed the plan before it ran: all else here is of the plan before that."""
 
 
 MAX_SUBTASKS = 64

@@ -33,6 +33,8 @@ BY_CODE: dict[str, str] = {
     "plan": "rephrase the instruction, or correct the plan, and submit it again",
     "pool": f"check the containers (`swiftbot pool`, `swiftbot doctor`), then {_AGAIN}",
     "robot": _ROBOT,
+    "contract": "`swiftbot robots check NAME` says what the robot's program does not keep to",
+    "precondition": "add the step that is missing, such as the way there, and submit it again",
     "taken": f"wait until its pilot gives the robot back, then {_AGAIN}",
     "record": "check that the disk has room; `swiftbot doctor` says more",
     "cancelled": _AGAIN,

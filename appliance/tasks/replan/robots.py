@@ -21,8 +21,8 @@ from appliance.tasks.replan.ties import left
 from appliance.tasks.revising import ACTIVE
 
 _ANY = re.compile(r"any\d{0,2}")
-_ITS_FAULT = ("robot", "busy", "taken", "contract")
-"""Codes of failures that are a robot's own."""
+_ITS_FAULT = ("robot", "busy", "taken", "contract", "precondition")
+"""Codes of failures that are of one robot: another may have its hand free, or be there already."""
 _ITS_WORD = ("refused", "unreachable", "deadline")
 """Codes that are a robot's when it is offline, or when a handler passed its final refusal on."""
 

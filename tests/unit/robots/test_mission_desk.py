@@ -241,7 +241,7 @@ async def test_what_would_not_run_is_refused_with_the_reason_of_its_plan(store: 
     ground.desk = MissionDesk(
         RobotsConfig(), site=SITE, store=store, refused=ground.refused, clock=lambda: ground.now, problems=problems
     )
-    assert await ground.upload([item(WAYPOINT, 1 + number % 30, 4, 8.0, 1.0) for number in range(40)]) == DENIED
+    assert await ground.upload([item(WAYPOINT, 1 + number % 30, 4, 8.0, 1.0) for number in range(40)]) == NO_SPACE
     assert "at most 64" in "".join(ground.texts)
     assert not store.values
 
