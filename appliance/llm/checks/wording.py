@@ -373,10 +373,11 @@ def time(facts: Facts) -> Iterable[Finding]:
     rest = set(left(facts))
     tokens = facts.reading.tokens
     found: list[int] = []
+    small = lx.FILLERS - {"every", "each"}
     text = facts.reading.text
     for match in (*_CLOCK.finditer(text), *_DELAYED.finditer(text), *_REPEATED.finditer(text)):
         inside = [n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()]
-        if inside and any(index in rest and tokens[index].text not in lx.FILLERS for index in inside):
+        if inside and any(index in rest and tokens[index].text not in small for index in inside):
             found += inside
     free = _free_values(facts)
     for match in _OFTEN.finditer(text):
