@@ -132,7 +132,7 @@ DELIVERY = _set(
 SUBORDINATE = _set("reaches arrives lands returns comes goes finishes stands")
 """Verbs of robots that say when something is to happen."""
 IN_NO_NAME = _set(
-    "till midnight noon tomorrow tonight daily hourly than unless without quarter half double turn degrees percent "
+    "rid till midnight noon tomorrow tonight daily hourly than unless without quarter half double turn degrees percent "
     "for at to while then until overnight always forever again sometimes times laps infinity once twice every "
     "before after when where which"
 )

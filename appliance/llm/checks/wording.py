@@ -401,8 +401,8 @@ def time(facts: Facts) -> Iterable[Finding]:
                 yield _hold("time", text, ())
     for index in sorted(rest):
         if tokens[index].kind == "word" and tokens[index].text in lx.TIMES:
-            if tokens[index].text == "again" and _after_motion(facts, index):
-                continue
+            if tokens[index].text == "again" and any(index - 1 in each for each in facts.account.called.values()):
+                continue  # "switch it off again"
             word = tokens[index].text
             hint = "clock times, delays and repeats are not supported yet: submit the order when it is due"
             yield _hold("time", f'the plan does not account for "{word}"', (word,), hint=hint)
@@ -890,6 +890,15 @@ def sequence(facts: Facts) -> Iterable[Finding]:
     called = facts.account.called
     evidence = {each.id: facts.account.values[each.id] or called[each.id] for each in subtasks}
     for number, token in enumerate(tokens):
+        if token.text == "first" and _closes(tokens, number):
+            begin = next(
+                (n for n in range(number, -1, -1) if tokens[n].text in _CLAUSE_END or tokens[n].text == "but"), 0
+            )
+            early = [each for each in subtasks if called[each.id] and min(called[each.id]) > begin]
+            late = [each for each in subtasks if called[each.id] and max(called[each.id]) < begin]
+            if any(b.id not in facts.before[a.id] for a in late for b in early if a.robot == b.robot):
+                yield _hold("sequence", '"first" is said at its end, and the plan has another order', ("first",))
+                return
         if token.text == "first" and number and tokens[number - 1].text == "but":
             early = [each for each in subtasks if called[each.id] and max(called[each.id]) > number]
             late = [each for each in subtasks if called[each.id] and max(called[each.id]) < number]
@@ -940,6 +949,11 @@ def _as_said(facts: Facts) -> Iterable[Finding]:
                 word = tokens[by_the_way].text
                 yield _hold("sequence", f'"{word}" is said, and the plan has another order', (word,))
                 return
+
+
+def _closes(tokens: Sequence[Token], number: int) -> bool:
+    """Whether a word ends a clause that another one precedes: "close the door, go to the office first"."""
+    return number + 1 >= len(tokens) or tokens[number + 1].text in _CLAUSE_END
 
 
 def _opposites(facts: Facts) -> Iterable[Finding]:
