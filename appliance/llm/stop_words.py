@@ -222,8 +222,8 @@ _WORDS: dict[_Kind, str] = {
         toute la flotte|alles|tout|tudo|tutto|wszystko|todo|tout le monde|iedereen|wszyscy|wszystkich|wszystkie""",
     _Kind.EACH: """
         all|all of|all of you|you all|all the|both|both of|both of you|every|each|any|todos|todas|ambos|tous|toutes|
-        tous les|les deux|alle|beide|jeder|jede|
-        alle beide|alle zwei|os dois|as duas|los dos|las dos|tutti e due|tutte e due|tutti|tutte|entrambi|allemaal|obie|oba|other|others|whole|entire""",
+        tous les|les deux|alle|beide|jeder|jede|alle beide|alle zwei|os dois|as duas|los dos|las dos|tutti e due|
+        tutte e due|tutti|tutte|entrambi|allemaal|obie|oba|other|others|whole|entire""",
     _Kind.ARTICLE: """
         the|a|an|these|those|my|our|your|el|la|los|las|le|les|l|die|der|das|den|dem|il|lo|gli|de|het|os|as|un|una|
         une|ein|eine|einen|al|a la|a los""",
