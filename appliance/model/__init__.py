@@ -99,6 +99,7 @@ from appliance.model.steering import (
 from appliance.model.tasks import (
     Attempt,
     Group,
+    LostOrder,
     LostRun,
     Split,
     SubtaskRecord,
@@ -131,6 +132,7 @@ __all__ = [
     "Lease",
     "Lifted",
     "LogLine",
+    "LostOrder",
     "LostRun",
     "Need",
     "Notice",

@@ -89,6 +89,17 @@ class LostRun(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True)
     state: SubtaskState
 
 
+class LostOrder(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
+    """An operator's order that a version of a task had carried out which lost against another."""
+
+    verb: str
+    """`approve`, `reject`, `cancel`, `retry` or `pause`."""
+    by: str
+    act: str = ""
+    """Id of the order in the audit log."""
+    at_ns: int = 0
+
+
 class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
     """A version of a task that lost: two coordinators had written it without knowing of each other (a partition)."""
 
@@ -98,6 +109,8 @@ class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
     state: TaskState
     runs: tuple[LostRun, ...] = ()
     """Its subtasks that had an attempt: which, where, and what had become of it."""
+    orders: tuple[LostOrder, ...] = ()
+    """Operators' orders that it had carried out; those the version that stands has not are lost."""
     settled: bool = False
     """Whether its runs have been ended and people told."""
     note: str = ""

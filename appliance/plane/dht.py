@@ -205,6 +205,10 @@ class Dht:
         """Return this gateway's shard: the records it holds, as owner or replica, without those removed."""
         return [record for record in await self._store.records(prefix) if not record.deleted]
 
+    def watch(self, heed: Callable[[str], bool], tell: Callable[[Record], None]) -> Callable[[], None]:
+        """Have `tell` hear of every change of a copy that this gateway holds (`Store.watch`); returns what ends it."""
+        return self._store.watch(heed, tell)
+
     # --- writing ----------------------------------------------------------------------------------------------
 
     async def _write(self, asked: Write) -> VersionVector:

@@ -244,6 +244,29 @@ class Store:
             self._commits.put(decided, db)
         return decided
 
+    def watch(self, heed: Callable[[str], bool], tell: Callable[[Record], None]) -> Callable[[], None]:
+        """Have `tell` hear, on the event loop and in order, of every record committed from now on whose key is heeded.
+
+        Whoever wrote it: this gateway, another one, or a comparison with other copies. Removals count too.
+
+        Args:
+            heed: whether a key is of interest; called on the store's thread for every record, so it must be quick, must
+                not raise, and may only look at what is safe to read from any thread.
+            tell: hears of the record.
+
+        Returns:
+            What ends it; records on their way to the event loop may still be told.
+        """
+
+        def committed(record: Record) -> None:
+            if heed(record.key):
+                # The loop may be gone when the process ends without closing: then nobody waits.
+                with contextlib.suppress(RuntimeError):
+                    self._loop.call_soon_threadsafe(tell, record)
+
+        self._commits.watchers.append(committed)
+        return lambda: self._commits.watchers.remove(committed)
+
     async def forget(self, record: Record) -> None:
         """Drop a copy that belongs elsewhere, if it is still that version."""
         await self._drop("DELETE FROM records WHERE key = ? AND digest = ? RETURNING key", record.key, digest(record))

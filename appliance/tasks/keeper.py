@@ -11,6 +11,7 @@ from typing import Any
 from appliance.errors import ConflictError, SwiftbotError
 from appliance.model import TaskRecord, VersionVector, encode
 from appliance.plane.node import Plane
+from appliance.plane.versions import descends
 from appliance.tasks import machine
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
@@ -43,6 +44,9 @@ class Keeper:
         self._on_change = on_change
         self._pending: list[Transition] = []
         self._dirty = False
+        self._writing = False
+        self._heard: VersionVector = version
+        """The version of this gateway's copy that was heard of last."""
         self.unknown = Unknown()
         """Fields of the record that this version does not know, and keeps."""
         self.ready_ns: dict[str, int] = {}
@@ -58,6 +62,21 @@ class Keeper:
     def version(self) -> VersionVector:
         """The record's version as it was written last."""
         return self._version
+
+    @property
+    def overtaken(self) -> bool:
+        """Whether the record is known to have moved on under this keeper: what it holds in memory is of the past.
+
+        While a write is under way that is not known, since the copy here is changed by that write before it returns;
+        `flush` looks when it has returned.
+        """
+        return not self._writing and not descends(self._version, self._heard)
+
+    def heard(self, version: VersionVector) -> bool:
+        """Take in the version of this gateway's copy, which has just changed; returns whether it was `overtaken`."""
+        if not descends(self._version, version):
+            self._heard = version
+        return self.overtaken
 
     @property
     def elapsed_s(self) -> float:
@@ -101,6 +120,7 @@ class Keeper:
         become durable together, which takes a replicated write off the successors' start.
         """
         if self._dirty:
+            self._writing = True
             try:
                 # Every write survives the death of processes. Only an end is synced to disk: what a power cut of
                 # the whole site takes from the middle of a task is done again under the same effect ids.
@@ -112,7 +132,12 @@ class Keeper:
                 )
             except ConflictError:
                 await self._reread()
+            finally:
+                self._writing = False
             self._dirty = False
+        if self.overtaken:
+            # Neither published nor acted upon: whoever drives by the record as it stands now does what follows from it.
+            raise SupersededError("the record has changed under it")
         if not self._pending:
             return
         self.on_written()

@@ -366,3 +366,24 @@ async def test_what_is_not_in_memory_is_read_from_the_file(tmp_path: Path) -> No
     await store.forget(_record("k"))
     assert store.look("k") == (True, None)
     await store.close()
+
+
+async def test_whoever_watches_a_key_hears_of_each_commit_of_it_in_order(tmp_path: Path) -> None:
+    """By whichever way it is written, removals too; of other keys nothing, and nothing once it is ended."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    heard: asyncio.Queue[Record] = asyncio.Queue()
+    ended = store.watch(lambda key: key == "task/1", heard.put_nowait)
+    written = [_record("task/1", b"a"), _record("task/1", b"b", 2), _record("task/1", b"", 3, deleted=True)]
+    await store.change("task/2", lambda _: _record("task/2"))
+    await store.change("task/1", lambda _: written[0])
+    decided, committed = store.change_soon("task/1", lambda _: written[1])
+    await decided
+    await committed
+    await store.change("task/1", lambda current: current)  # nothing changes
+    await asyncio.gather(*(store.change(f"task/{each}", lambda _: written[2]) for each in (1,)), store.put("k", b"v"))
+    async with asyncio.timeout(60):
+        assert [await heard.get() for _ in written] == written
+    ended()
+    await store.change("task/1", lambda _: _record("task/1", b"c", 4))
+    await store.close()
+    assert heard.empty()

@@ -1,12 +1,16 @@
 """What a driver knows must be written before its gateway goes."""
 
+import asyncio
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
+
+import pytest
 
 from appliance.model import Plan, Subtask
+from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.tasks import machine
-from appliance.tasks.keeper import Keeper
+from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import Transition, TransitionKind
 
 
@@ -31,3 +35,44 @@ def test_a_run_of_this_gateway_unsettles_until_its_end_is_written() -> None:
         )
         assert keeper.take(end)
         assert not keeper.settled
+
+
+def moving(plane: Any) -> Keeper:
+    """A keeper of an accepted task with a transition that is not written yet."""
+    plane.dht.records["task/t-1"] = Record(key="task/t-1", value=b"{}", version={"gw-1": 1})
+    keeper = Keeper(plane, plane.accepted(), {"gw-1": 1}, lambda _: None)
+    keeper.apply(keeper.transition(TransitionKind.PLANNED, plan=plane.plan_of()))
+    return keeper
+
+
+@pytest.mark.anyio
+async def test_a_keepers_own_write_does_not_overtake_it(plane: Any) -> None:
+    """The copy here changes before the write returns: that is the keeper's own doing, and it goes on."""
+    keeper = moving(plane)
+    plane.dht.watch(lambda _: True, lambda record: keeper.heard(record.version))
+    await keeper.flush()
+    await asyncio.sleep(0)
+    assert not keeper.overtaken
+    assert plane.session.puts
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("durable", [True, False])
+async def test_nothing_is_published_or_begun_by_a_record_that_was_overtaken(plane: Any, durable: bool) -> None:
+    """Neither behind a write of its own, nor where nothing needs to be written: no order goes out twice."""
+    keeper = moving(plane)
+    if durable:
+        plane.dht.watch(lambda _: True, lambda record: keeper.heard({**record.version, "gw-2": 3}))
+    else:
+        await keeper.flush()
+        keeper.apply(
+            keeper.transition(TransitionKind.DISPATCHED, subtask="s1", attempt=1, gateway="gw-1"), durable=False
+        )
+        keeper.heard({**keeper.version, "gw-2": 3})
+    plane.session.puts.clear()
+    begun: list[None] = []
+    keeper.on_written = lambda: begun.append(None)
+    writing = asyncio.ensure_future(keeper.flush())
+    with pytest.raises(SupersededError):
+        await writing
+    assert (plane.session.puts, begun) == ([], [])
