@@ -36,6 +36,7 @@ from appliance.record.facts import LogInfo
 from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.check import CheckReport
+from appliance.tasks.remembering import done_text
 from appliance.tasks.replay import ReplayReport
 
 PIPE_WIDTH = 160
@@ -202,6 +203,8 @@ def task_table(record: TaskRecord) -> Group:
         for each in record.subtasks
         if (text := brief(each))
     ]
+    if done := done_text(record):
+        table = Text("\n".join([done, *([record.note] if record.note else [])]))
     parts: list[object] = [head, table, *ways, *told, *revision_lines(record)]
     if record.failure is not None:
         remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""

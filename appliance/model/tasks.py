@@ -117,6 +117,15 @@ class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
     """What that was, in words."""
 
 
+class Remembered(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Marks a record that was trimmed: only the outcome of the task is kept, so that its id is not done again."""
+
+    log: str = ""
+    """Names of the log files that were written when the task ended; empty: not known."""
+    request: str = ""
+    """Digest of the request; empty: not known."""
+
+
 class Group(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The dynamic group of a task: the gateways that may serve it (paper, Dynamic Groups).
 
@@ -185,6 +194,8 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Number of transitions applied so far."""
     splits: tuple[Split, ...] = ()
     """Versions that lost against this one, at most 8."""
+    remembered: Remembered | None = None
+    """Set in a record that was trimmed after its end: plan, subtasks and results are gone."""
 
     @property
     def paused(self) -> str:

@@ -191,10 +191,10 @@ class Driving:
                 driving.cancel()
         final: dict[str, VersionVector] = {}
         for stored in await self._plane.dht.local("task/"):
-            if stored.deleted or not self._plane.dht.owns(stored.key):
-                continue
-            if self._final.get(stored.key) == stored.version:
+            if self._final.get(stored.key) == stored.version:  # the most by far, ids of old tasks among them
                 final[stored.key] = stored.version
+                continue
+            if stored.deleted or not self._plane.dht.owns(stored.key):
                 continue
             try:
                 record = read_record(stored.value)
@@ -249,6 +249,7 @@ class Driving:
         self._healing.pop(task, None)
         if not done.cancelled() and (error := done.exception()) is not None:
             log.info("what a partition left is settled later", task=task, reason=str(error))
+            self._final.pop(task_key(task), None)  # looked at again with the next sweep
 
     def _sweep_soon(self) -> None:
         """Look through the shard again a few times: records of the other side of a partition come bit by bit."""

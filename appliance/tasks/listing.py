@@ -11,6 +11,7 @@ from appliance.model import TaskRecord
 from appliance.plane.node import Plane
 from appliance.tasks.api import TaskList, TasksAsk
 from appliance.tasks.bounds import read_record
+from appliance.tasks.remembering import is_trimmed
 
 ANSWER_S = 2.0
 
@@ -25,7 +26,8 @@ async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]
     """
     found: dict[str, TaskRecord] = {}
     for stored in await plane.dht.local("task/"):
-        if not stored.deleted:
+        # What is only remembered is in no list: there are many, and decoding them for each question takes long.
+        if not stored.deleted and not is_trimmed(stored.value):
             with contextlib.suppress(PayloadError):
                 record = read_record(stored.value)
                 found[record.id] = record

@@ -42,11 +42,12 @@ from appliance.pool.api import Hinted
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import driving as module
 from appliance.tasks import machine
-from appliance.tasks.api import RunStatus, TaskAsk
+from appliance.tasks.api import RunStatus, TaskAsk, TasksAsk, WhyAsk
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
+from appliance.tasks.remembering import trimmed
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.steering.api import CancelTaskAsk, RetryAsk
 
@@ -428,3 +429,17 @@ async def test_a_driver_of_a_key_that_is_anothers_answers_for_nobody(manager: Ta
     other = replace(read_record(stored.value), state=TaskState.CANCELLED, coordinator="gw-2")
     plane.dht.records[stored.key] = Record(key=stored.key, value=encode(other), version={"gw-2": 9})
     assert (await manager.task(TaskAsk(id="t-1"))).state is TaskState.CANCELLED
+
+
+async def test_an_id_whose_record_was_trimmed_is_not_done_again(manager: TaskManager, plane: Any) -> None:
+    """It is answered with the outcome, on whatever way it comes; nothing is driven, and it is in no list."""
+    record = replace(plane.accepted(plan=plane.plan_of()), state=TaskState.SUCCEEDED, sequence=5)
+    small = trimmed(record, "recorder-1.mcap")
+    plane.dht.records["task/t-1"] = Record(key="task/t-1", value=encode(small), version={"gw-2": 1})
+    for door in (manager.submit, manager.accept):
+        assert await door(wish(plane)) == small
+    assert "details are in the log recorder-1.mcap" in (await manager.why(WhyAsk(id="t-1"))).done
+    assert (await manager.tasks(TasksAsk(limit=10, local=True))).tasks == ()
+    await until(lambda: not manager._sweep.is_set())
+    assert manager.unfinished == 0
+    assert plane.dht.records["task/t-1"].version == {"gw-2": 1}
