@@ -119,7 +119,7 @@ class Keeper:
         One write covers all transitions since the last: a finished subtask and the dispatch of its successors
         become durable together, which takes a replicated write off the successors' start.
         """
-        if self._dirty:
+        if written := self._dirty:
             self._writing = True
             try:
                 # Every write survives the death of processes. Only an end is synced to disk: what a power cut of
@@ -136,18 +136,25 @@ class Keeper:
                 self._writing = False
             self._dirty = False
         if self.overtaken:
-            # Neither published nor acted upon: whoever drives by the record as it stands now does what follows from it.
+            # Nothing follows from it, and the record is no news: whoever drives by the one that stands sees to both.
+            # What was written is told all the same: others may have gone on from it, and a log must have what led there.
+            if written:
+                self._publish()
             raise SupersededError("the record has changed under it")
         if not self._pending:
             return
         self.on_written()
+        self._publish()
+        self._plane.session.put(self._plane.keys.task(self.record.id), with_unknown(self.record, self.unknown))
+        self.told = self.record
+        self._on_change(self.record)
+
+    def _publish(self) -> None:
+        """Publish the transitions that led to what is written."""
         for transition in self._pending:
             self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
             self.on_published(transition)
         self._pending.clear()
-        self._plane.session.put(self._plane.keys.task(self.record.id), with_unknown(self.record, self.unknown))
-        self.told = self.record
-        self._on_change(self.record)
 
     def take(self, transition: Transition, *, durable: bool = True) -> bool:
         """Apply a transition if it fits; returns whether it did."""
