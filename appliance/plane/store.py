@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 from appliance.plane.ahead import NOTHING, Mark
 from appliance.plane.commits import Call, Commits
-from appliance.plane.rows import read_digests, read_kept, read_records, read_row
+from appliance.plane.rows import LeaveOut, read_digests, read_kept, read_page, read_records, read_row
 from appliance.plane.versions import Record, digest
 
 T = TypeVar("T")
@@ -105,6 +105,13 @@ class Store:
     async def records(self, prefix: str) -> list[Record]:
         """Return every record with that prefix, tombstones too, in order of keys."""
         return await self._call(partial(read_records, prefix=prefix))
+
+    async def page(self, prefix: str, after: str = "", leave_out: LeaveOut | None = None) -> list[Record]:
+        """Return the next records with that prefix and a key above `after`, in order; none: there are no more.
+
+        Read so, many records do not hold up what else waits for the disk; between pages they may change.
+        """
+        return await self._call(partial(read_page, prefix=prefix, after=after, leave_out=leave_out))
 
     async def digests(self) -> list[tuple[str, str]]:
         """Return (key, digest) of every record, in order of keys."""

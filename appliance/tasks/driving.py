@@ -25,6 +25,7 @@ from appliance.tasks.deadline import Ages
 from appliance.tasks.driver import Driver
 from appliance.tasks.healing import heal
 from appliance.tasks.keeper import Keeper
+from appliance.tasks.remembering import TRIMMED
 from appliance.tasks.soundness import unsound
 from appliance.tasks.surroundings import PREFIX, Surroundings, task_key
 from appliance.tasks.unknown import unknown
@@ -190,8 +191,8 @@ class Driving:
             if not self._plane.dht.owns(task_key(task_id)):
                 driving.cancel()
         final: dict[str, VersionVector] = {}
-        for stored in await self._plane.dht.local("task/"):
-            if self._final.get(stored.key) == stored.version:  # the most by far, ids of old tasks among them
+        for stored in await self._plane.dht.local(PREFIX, leave_out=TRIMMED):
+            if self._final.get(stored.key) == stored.version:  # the most by far
                 final[stored.key] = stored.version
                 continue
             if stored.deleted or not self._plane.dht.owns(stored.key):

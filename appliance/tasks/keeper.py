@@ -137,7 +137,7 @@ class Keeper:
             self._dirty = False
         if self.overtaken:
             # Nothing follows from it, and the record is no news: whoever drives by the one that stands sees to both.
-            # What was written is told all the same: others may have gone on from it, and a log must have what led there.
+            # What was written is told all the same: others may have gone on from it, so a log must have it.
             if written:
                 self._publish()
             raise SupersededError("the record has changed under it")

@@ -15,12 +15,18 @@ from msgspec.structs import replace
 
 from appliance.errors import RefusedError
 from appliance.model import Plan, Remembered, TaskRecord, TaskRequest, encode
+from appliance.plane.dht import LeaveOut
 from appliance.tasks.bounds import MAX_NOTE, clean
 from appliance.tasks.healing import unsettled
 
 MAX_INSTRUCTION = 80
 """Characters of the instruction that stay, to recognise the task by."""
-_MARK, _PLAN = b'"remembered":{', b'"plan":'
+TRIMMED = LeaveOut(has=b'"remembered":{', lacks=b'"plan":')
+"""What tells a tombstone as it is stored from a whole record, without decoding it.
+
+Within a JSON text quotes are escaped, so that the mark can only be a field's name: this one, or a parameter's, which
+only a record with a plan has.
+"""
 _DAY_NS = 86_400 * 10**9
 
 
@@ -74,15 +80,6 @@ def _newest(each: Kept) -> tuple[int, str]:
 def may_trim(record: TaskRecord) -> bool:
     """Whether nothing is left to be done about a record: it has ended, and what a partition left of it is settled."""
     return record.state.final and not unsettled(record)
-
-
-def is_trimmed(value: bytes) -> bool:
-    """Whether a stored record is a tombstone, without decoding it.
-
-    Within a JSON text quotes are escaped, so that the mark can only be a field's name: this one, or a parameter's,
-    which only a record with a plan has.
-    """
-    return _MARK in value and _PLAN not in value
 
 
 def trimmed(record: TaskRecord, log: str) -> TaskRecord:

@@ -387,3 +387,19 @@ async def test_whoever_watches_a_key_hears_of_each_commit_of_it_in_order(tmp_pat
     await store.change("task/1", lambda _: _record("task/1", b"c", 4))
     await store.close()
     assert heard.empty()
+
+
+async def test_records_are_read_page_by_page(tmp_path: Path) -> None:
+    """All with the prefix, each once and in order, however many there are and however long; others stay out."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    wanted = [_record(f"task/{number:05}", b"x" * (number % 7)) for number in range(1200)]
+    beside = [_record("tas"), _record("task0"), _record("tasl/1")]
+    await asyncio.gather(*(store.change(each.key, lambda _, each=each: each) for each in (*wanted, *beside)))
+    found: list[Record] = []
+    pages = 0
+    while page := await store.page("task/", found[-1].key if found else ""):
+        found += page
+        pages += 1
+    assert found == wanted
+    assert pages > 1
+    await store.close()

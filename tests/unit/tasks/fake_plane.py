@@ -10,7 +10,7 @@ import msgspec
 
 from appliance.errors import ConflictError, SwiftbotError, UnreachableError
 from appliance.model import Plan, TaskRecord, VersionVector
-from appliance.plane.dht import Record
+from appliance.plane.dht import LeaveOut, Record
 from appliance.plane.keys import Keys
 from appliance.plane.session import Message
 from appliance.plane.versions import increment
@@ -140,10 +140,13 @@ class FakeDht:
             raise ConflictError(f"{key} has moved on")
         del self.records[key]
 
-    async def local(self, prefix: str) -> list[Record]:
+    async def local(self, prefix: str, *, leave_out: LeaveOut | None = None) -> list[Record]:
         """Return the shard."""
         await asyncio.sleep(0)
-        return [record for key, record in self.records.items() if key.startswith(prefix)]
+        found = [record for key, record in self.records.items() if key.startswith(prefix)]
+        if leave_out is None:
+            return found
+        return [each for each in found if not (leave_out.has in each.value and leave_out.lacks not in each.value)]
 
     def owns(self, key: str) -> bool:
         """Whether all keys are ours."""

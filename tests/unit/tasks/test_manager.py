@@ -148,7 +148,7 @@ async def test_a_broken_sweep_and_poisoned_records_do_not_end_takeover(manager: 
     await asyncio.sleep(0.02)
     working = plane.dht.local
 
-    async def broken(prefix: str) -> list[Any]:
+    async def broken(prefix: str, **_: object) -> list[Any]:
         raise OSError("the disk is gone")
 
     plane.dht.local = broken

@@ -1,5 +1,6 @@
 """Ids of finished tasks: what is remembered of them, for how long, and what whoever uses one again is answered."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,12 +10,14 @@ from msgspec.structs import replace
 
 from appliance.errors import RefusedError
 from appliance.model import Failure, Plan, Split, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState, encode
+from appliance.plane.store import Store
+from appliance.plane.versions import Record
 from appliance.tasks.remembering import (
+    TRIMMED,
     Kept,
     answered,
     done_text,
     due,
-    is_trimmed,
     may_trim,
     trimmed,
 )
@@ -22,6 +25,8 @@ from appliance.tasks.resolve import merged, stronger
 from appliance.tasks.steering.api import RetryAsk
 from appliance.tasks.steering.deciding import may_retry
 from appliance.tasks.why import why
+
+pytestmark = pytest.mark.anyio
 
 DAY_NS = 86_400 * 10**9
 NOW_NS = 1_800_000_000 * 10**9
@@ -111,11 +116,22 @@ def test_a_tombstone_is_small_and_says_what_came_of_the_task() -> None:
     assert "logs of that day" in done_text(trimmed(done(), ""))
 
 
-def test_a_tombstone_is_recognised_as_it_is_stored() -> None:
-    """By its field, and not by a parameter or a text that looks like it."""
-    assert is_trimmed(encode(trimmed(done(instruction='say "remembered":{'), "")))
-    assert not is_trimmed(encode(done()))
-    assert not is_trimmed(encode(replace(done(), plan=None, subtasks=(), instruction='"remembered":{')))
+async def test_a_tombstone_is_recognised_as_it_is_stored(tmp_path: Path) -> None:
+    """By its field, and not by a parameter or a text that looks like it: what is looked through has the others."""
+    looks_like = '"remembered":{'
+    values = {
+        "task/small": encode(trimmed(done(instruction=f"say {looks_like}"), "")),
+        "task/whole": encode(done()),
+        "task/failed": encode(done(plan=None, subtasks=(), instruction=looks_like)),
+    }
+    store = await Store.open(tmp_path / "s.sqlite")
+    for key, value in values.items():
+        await store.change(
+            key, lambda _, key=key, value=value: Record(key=key, value=value, version={"a": 1}, write="w")
+        )
+    assert [each.key for each in await store.page("task/", leave_out=TRIMMED)] == ["task/failed", "task/whole"]
+    assert len(await store.page("task/")) == 3
+    await store.close()
 
 
 def test_an_id_used_again_is_answered_with_what_came_of_it() -> None:
