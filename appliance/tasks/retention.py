@@ -96,7 +96,9 @@ class Retention:
         """Trim the oldest finished tasks, and forget those that were trimmed long ago; returns how many."""
         owned = await self._owned(PREFIX)
         finished: dict[str, TaskRecord] = {}
-        for key, stored in owned.items():
+        for number, (key, stored) in enumerate(owned.items()):
+            if number % AT_ONCE == 0:
+                await asyncio.sleep(0)  # thousands take tens of milliseconds, in which runs have news
             with contextlib.suppress(PayloadError):
                 record = read_record(stored.value)
                 if may_trim(record):
