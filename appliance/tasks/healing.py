@@ -48,8 +48,18 @@ _ACTIVE = (SubtaskState.DISPATCHED, SubtaskState.RUNNING)
 
 
 def unsettled(record: TaskRecord) -> tuple[Split, ...]:
-    """Versions that lost and are not dealt with yet."""
-    return tuple(each for each in record.splits if not each.settled)
+    """Versions that lost and are not dealt with yet, or were dealt with in a version that itself lost later.
+
+    Of the latter the mark that they are settled outlives (`resolve.merged`), and the fences do not: without them a
+    second attempt would be given a number, and its gateway answer with what came of the first.
+    """
+    return tuple(each for each in record.splits if not each.settled or _unfenced(record, each))
+
+
+def _unfenced(record: TaskRecord, split: Split) -> bool:
+    """Whether an attempt of a version that lost has a number that the next attempt of this version may be given."""
+    made = {run.subtask: run.attempt for run in sorted(split.runs, key=lambda run: run.attempt)}
+    return any(made.get(each.subtask.id, 0) >= each.next_attempt and not each.state.final for each in record.subtasks)
 
 
 def foreign(record: TaskRecord, event: RunEvent) -> bool:
@@ -135,7 +145,7 @@ def heal(record: TaskRecord) -> Healing | None:
             if own is not None and own.state in _ACTIVE and own.bound_robot and run.attempt > own.attempt:
                 superseded.add(run.subtask)
         note = ""
-        if doubled:
+        if doubled and not split.settled:
             note = clean(
                 f"a partition has healed: task {record.id} had gone on on both sides; the version of "
                 f"{split.coordinator} ({split.state}) lost to that of {record.coordinator} ({record.state}); "
@@ -145,6 +155,9 @@ def heal(record: TaskRecord) -> Healing | None:
             notes.append(note)
             noted.append(f"{split.coordinator}-{split.sequence}")
             recipients.append(NOTICED)
+        if split.settled:  # people have been told
+            settled.append(split)
+            continue
         said = [note] if note else []
         for order in overruled(split, record):
             name = f"order-{order.act or f'{order.verb}-{order.at_ns}'}"
@@ -154,7 +167,7 @@ def heal(record: TaskRecord) -> Healing | None:
                 noted.append(name)
                 recipients.append(_recipient(order.by))
         settled.append(replace(split, settled=True, note=clean("; ".join(said), MAX_NOTE)))
-    others = tuple(each for each in record.splits if each.settled)
+    others = tuple(each for each in record.splits if each not in fresh)
     return Healing(
         splits=tuple(sorted((*others, *settled), key=lambda each: (each.coordinator, each.sequence))),
         fences=fences,

@@ -215,3 +215,20 @@ def test_an_operator_whose_name_is_no_key_is_told_as_an_operator(plane: Any) -> 
     assert healing is not None
     assert (healing.to, healing.noted) == (("operator",), ("order-cancel-3",))
     assert "by Ann of the night shift" in healing.notes[0]
+
+
+def test_fences_survive_the_loss_of_the_version_that_set_them(plane: Any) -> None:
+    """Settled in a version that lost in its turn: no number is given twice, runs are ended, nobody is told twice."""
+    settled = replace(split(lost(3, "gw-3")), settled=True, note="told")
+    record = record_of(plane, settled)
+    healing = heal(record)
+    assert healing is not None
+    assert healing.fences == {"s1": 3}
+    assert [(each.attempt, each.gateway) for each in healing.ends] == [(3, "gw-3")]
+    assert (healing.notes, healing.splits) == ((), (settled,))
+    after = apply(record, _step(4, TransitionKind.HEALED, splits=healing.splits, fences=healing.fences))
+    assert after.subtasks[0].next_attempt == 4
+    assert heal(after) is None
+    assert heal(record_of(plane, replace(split(lost(1, "gw-3")), settled=True))) is None, "below its own: fenced off"
+    done = replace(record.subtasks[0], state=SubtaskState.SUCCEEDED)
+    assert heal(replace(record, subtasks=(done,))) is None, "there will be no next attempt"
