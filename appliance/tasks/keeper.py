@@ -167,5 +167,11 @@ class Keeper:
         current = await self._plane.dht.read(task_key(self.record.id))
         holder = ""
         if current is not None:
-            holder = read_record(current.value).coordinator
+            found = read_record(current.value)
+            holder = found.coordinator
+            if (holder, found.sequence, found.updated_ns) == (
+                self.record.coordinator, self.record.sequence, self.record.updated_ns,
+            ):  # fmt: skip
+                # It was written, and stands with what another version adds to it: a log must have what led there.
+                self._publish()
         raise SupersededError(f"the record has moved on to {holder or 'nobody'}")

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 
-from appliance.model import Plan, Subtask
+from appliance.model import Plan, Subtask, encode
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.tasks import machine
@@ -80,3 +81,15 @@ async def test_nothing_is_begun_by_a_record_that_was_overtaken(plane: Any, durab
     assert told == ([TransitionKind.PLANNED] if durable else [])
     assert len(plane.session.puts) == len(told)
     assert begun == []
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("stands", [True, False])
+async def test_a_write_that_stands_after_a_conflict_is_told(plane: Any, stands: bool) -> None:
+    """Another version was written elsewhere too and lost: the keeper stops, and the log has what led to what stands."""
+    keeper = moving(plane)
+    standing = keeper.record if stands else replace(keeper.record, coordinator="gw-2")
+    plane.dht.change(Record(key="task/t-1", value=encode(standing), version={"gw-1": 2, "gw-2": 1}))
+    with pytest.raises(SupersededError):
+        await keeper.flush()
+    assert bool(plane.session.sent(plane.keys.transition("t-1"), Transition)) is stands
