@@ -39,6 +39,7 @@ from appliance.record.heard import kinds_text, problem_of, together
 from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.check import CheckReport
+from appliance.tasks.remembering import done_text
 from appliance.tasks.replay import ReplayReport
 from appliance.tasks.why import waits_for
 
@@ -225,6 +226,8 @@ def task_table(record: TaskRecord) -> Group:
         for each in record.subtasks
         if (text := brief(each))
     ]
+    if done := done_text(record):
+        table = Text("\n".join([done, *([record.note] if record.note else [])]))
     parts: list[object] = [head, table, *ways, *told, *revision_lines(record)]
     if record.failure is not None:
         remedy = f" ({record.failure.remedy})" if record.failure.remedy else ""

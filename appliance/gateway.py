@@ -221,8 +221,9 @@ class Gateway:
         self._stack.push_async_callback(self.migration.close)
         self._robot_tasks.open(self.manager)
         self._stack.callback(self._robot_tasks.close)
+        self._retention = Retention(self.plane, config.tasks)
         self._publish_status()
-        for work in (self._keep_publishing(), Retention(self.plane, config.tasks).run()):
+        for work in (self._keep_publishing(), self._retention.run()):
             self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
 
@@ -421,6 +422,7 @@ class Gateway:
             endpoints=self.config.plane.listen,
             refused=dict(counters),
             monitor=dict(self.manager.recovery.counts),
+            forgotten=self._retention.forgotten,
             started_ns=self._started_ns,
             pid=os.getpid(),
             age_ms=round((time.monotonic() - vitals.at) * 1e3),

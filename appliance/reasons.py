@@ -24,6 +24,7 @@ def why_text(found: TaskWhy) -> Group:
         Text.assemble(("task ", "bold"), found.id, f" {found.state}  coordinated by {found.coordinator}"),
         *_task_text(found),
         *([Text(f"waits for: {found.waits}", style="bold yellow")] if found.waits else []),
+        *([Text(found.done)] if found.done else []),
     ]
     for each in found.subtasks:
         waits = f"  {each.note}" if each.note and not each.attempts and each.waits is None else ""

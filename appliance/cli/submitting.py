@@ -72,6 +72,9 @@ class Submitting:
                 return stopped
             try:
                 accepted = await client.submit(self._request)
+                if accepted.remembered is not None:
+                    console.err.print(f"task {accepted.id} was handed in before and is not begun again")
+                    return accepted
                 console.err.print(f"task {accepted.id} is accepted")
                 if self._wait:
                     return await self._follow(client)
@@ -91,7 +94,7 @@ class Submitting:
             try:
                 with console.err.status("planning"):
                     accepted = await client.submit(self._request)
-                    return await client.planned(accepted.id)
+                    return accepted if accepted.remembered is not None else await client.planned(accepted.id)
             except asyncio.CancelledError:
                 await self._cancel(client)
                 raise

@@ -84,7 +84,7 @@ def submit(
         found = submitting.run_shown() if shown else submitting.run()
     if isinstance(found, Stopped):
         return show_stopped(found, as_json=as_json)
-    if as_json or not wait or found.state is TaskState.CANCELLED:
+    if as_json or not wait or found.state is TaskState.CANCELLED or found.remembered is not None:
         show(view(found), as_json=as_json, table=console.task_table(found))
     return _outcome(found)
 

@@ -133,6 +133,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     endpoints: tuple[str, ...] = ()
     refused: dict[str, int] = field(default_factory=dict[str, int])
     """Counters of bad input by kind, since start."""
+    forgotten: int = 0
+    """Ids of finished tasks forgotten before their time since start: there were more than `tasks.remember_most`."""
     monitor: dict[str, int] = field(default_factory=dict[str, int])
     """What the execution monitor found and did as coordinator, by kind, since start."""
     started_ns: int = 0

@@ -89,6 +89,17 @@ class LostRun(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True)
     state: SubtaskState
 
 
+class LostOrder(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
+    """An operator's order that a version of a task had carried out which lost against another."""
+
+    verb: str
+    """`approve`, `reject`, `cancel`, `retry` or `pause`."""
+    by: str
+    act: str = ""
+    """Id of the order in the audit log."""
+    at_ns: int = 0
+
+
 class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
     """A version of a task that lost: two coordinators had written it without knowing of each other (a partition)."""
 
@@ -98,10 +109,21 @@ class Split(Struct, frozen=True, kw_only=True, omit_defaults=True, order=True):
     state: TaskState
     runs: tuple[LostRun, ...] = ()
     """Its subtasks that had an attempt: which, where, and what had become of it."""
+    orders: tuple[LostOrder, ...] = ()
+    """Operators' orders that it had carried out; those the version that stands has not are lost."""
     settled: bool = False
     """Whether its runs have been ended and people told."""
     note: str = ""
     """What that was, in words."""
+
+
+class Remembered(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Marks a record that was trimmed: only the outcome of the task is kept, so that its id is not done again."""
+
+    log: str = ""
+    """Names of the log files that were written when the task ended; empty: not known."""
+    request: str = ""
+    """Digest of the request; empty: not known."""
 
 
 class Group(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -172,6 +194,8 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Number of transitions applied so far."""
     splits: tuple[Split, ...] = ()
     """Versions that lost against this one, at most 8."""
+    remembered: Remembered | None = None
+    """Set in a record that was trimmed after its end: plan, subtasks and results are gone."""
 
     @property
     def paused(self) -> str:

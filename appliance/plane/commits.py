@@ -59,6 +59,8 @@ class Commits:
         self.lock = threading.RLock()
         """Under which calls are queued."""
         self.closing = False
+        self.watchers: list[Callable[[Record], None]] = []
+        """Told each record that was committed, on the store's thread."""
         self._opened = opened
         self._waiting: deque[Call] = deque()
         # One that is written in C: a condition of Python's takes a good part of a commit's time.
@@ -219,12 +221,16 @@ class Commits:
         return False
 
     def _show(self) -> None:
-        """Have the picture follow a commit."""
+        """Have the picture follow a commit, then those who watch records."""
         for change in self._changed:
             if isinstance(change, str):
                 self.picture.drop(change)
             else:
                 self.picture.put(change)
+        for watcher in tuple(self.watchers):
+            for change in self._changed:
+                if not isinstance(change, str):
+                    watcher(change)
         self._changed.clear()
 
     def _set_synchronous(self, db: sqlite3.Connection, *, durable: bool) -> None:

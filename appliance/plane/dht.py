@@ -24,6 +24,7 @@ from appliance.plane.ordering import Ordering
 from appliance.plane.pulse import Pulse
 from appliance.plane.pushing import Pushing
 from appliance.plane.quorum.voting import Voting
+from appliance.plane.rows import LeaveOut
 from appliance.plane.rpc import AtOnce, Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.settling import Settling
@@ -39,7 +40,7 @@ from appliance.plane.versions import (
     settle,
 )
 
-__all__ = ["Dht", "Record", "Resolver"]
+__all__ = ["Dht", "LeaveOut", "Record", "Resolver"]
 
 log = structlog.get_logger(__name__)
 
@@ -201,9 +202,21 @@ class Dht:
         """Whether a key belongs to this gateway just now."""
         return self._membership.owns(key)
 
-    async def local(self, prefix: str) -> list[Record]:
-        """Return this gateway's shard: the records it holds, as owner or replica, without those removed."""
-        return [record for record in await self._store.records(prefix) if not record.deleted]
+    async def local(self, prefix: str, *, leave_out: LeaveOut | None = None) -> list[Record]:
+        """Return this gateway's shard: the records it holds, as owner or replica, without those removed.
+
+        `leave_out`: nor those with such a value. Read page by page: it is no picture of one moment.
+        """
+        found: list[Record] = []
+        after = ""
+        while page := await self._store.page(prefix, after, leave_out):
+            found += (record for record in page if not record.deleted)
+            after = page[-1].key
+        return found
+
+    def watch(self, heed: Callable[[str], bool], tell: Callable[[Record], None]) -> Callable[[], None]:
+        """Have `tell` hear of every change of a copy that this gateway holds (`Store.watch`); returns what ends it."""
+        return self._store.watch(heed, tell)
 
     # --- writing ----------------------------------------------------------------------------------------------
 

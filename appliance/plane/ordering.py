@@ -82,10 +82,9 @@ class Ordering:
             SwiftbotError: the disk fails.
         """
         check_write(asked, max_bytes=self._config.max_record_bytes)
-        if not self._membership.owns(asked.key):
-            owner = self._membership.ring.owner(asked.key)
-            raise RefusedError(f"{asked.key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
-        await self._settling.until_mine(asked.key, returned_s=RETURNED_S)
+        self._check_owned(asked.key)
+        if not await self._settling.until_mine(asked.key, returned_s=RETURNED_S):
+            self._check_owned(asked.key)  # the ring may have given it away meanwhile
         if asked.key in self._unsaved:
             await self._catch_up(asked.key)
         try:
@@ -113,6 +112,12 @@ class Ordering:
             raise
         self._lately.ended(asked.key, asked.write, version)
         return Written(version)
+
+    def _check_owned(self, key: str) -> None:
+        """Raise RefusedError when a key is another gateway's."""
+        if not self._membership.owns(key):
+            owner = self._membership.ring.owner(key)
+            raise RefusedError(f"{key} belongs to {owner}, not to {self._gateway}", remedy="ask there")
 
     async def _decide(self, asked: Write) -> tuple[Record, asyncio.Future[Record | None]]:
         """Decide as the owner; returns the record, and what ends when it is committed here."""

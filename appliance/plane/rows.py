@@ -8,7 +8,7 @@ and digests took 7 ms alone and 4.6 s beside a busy thread, in pages 8 ms and 15
 import sqlite3
 import time
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
@@ -64,10 +64,27 @@ def _record(key: str, value: bytes, version: str, deleted: int, write: str) -> R
     )
 
 
+class LeaveOut(NamedTuple):
+    """Records that are not wanted, by what is in their value: told apart by SQLite, which is far quicker than here."""
+
+    has: bytes
+    lacks: bytes
+
+
 def read_records(db: sqlite3.Connection, prefix: str) -> list[Record]:
     """Every record with that prefix, tombstones too, in order of keys."""
+    return _read_records(db, prefix, Page())
+
+
+def read_page(db: sqlite3.Connection, prefix: str, after: str, leave_out: LeaveOut | None) -> list[Record]:
+    """The next records with that prefix and a key above `after`, in order of keys; none: there are no more."""
+    first = f"{after}\0" if after else prefix
+    return _read_records(db, prefix, Page(first=first, once=True, leave_out=leave_out))
+
+
+def _read_records(db: sqlite3.Connection, prefix: str, page: "Page") -> list[Record]:
     rows = _rows(
-        db, f"{_COLUMNS} FROM records", _COLUMNS.replace("value", "hex(value)"), prefix, _RECORDS, _MOST_VALUES
+        db, f"{_COLUMNS} FROM records", _COLUMNS.replace("value", "hex(value)"), prefix, _RECORDS, _MOST_VALUES, page
     )
     return [_record(key, bytes.fromhex(value), version, deleted, write) for key, value, version, deleted, write in rows]
 
@@ -88,17 +105,33 @@ def read_kept(db: sqlite3.Connection, prefix: str) -> list[tuple[str, bytes]]:
     return [(key, bytes.fromhex(value)) for key, value in rows]
 
 
+class Page(NamedTuple):
+    """Where reading begins (empty: with the first), whether it is for one page alone, and what is left out."""
+
+    first: str = ""
+    once: bool = False
+    leave_out: LeaveOut | None = None
+
+
 def _rows(
-    db: sqlite3.Connection, source: str, columns: str, prefix: str, decoder: "msgspec.json.Decoder[list[T]]", most: int
+    db: sqlite3.Connection,
+    source: str,
+    columns: str,
+    prefix: str,
+    decoder: "msgspec.json.Decoder[list[T]]",
+    most: int,
+    page_of: Page = Page(),  # noqa: B008 - immutable
 ) -> Iterator[T]:
     """`columns` of the rows whose `key`, the first of them, has that prefix; read in pages of at most `most`."""
     # So that the index serves it. Without a prefix there is no end: a key may begin with the last code point too.
     end, bounds = ("AND key < ?", (prefix + _LAST,)) if prefix else ("", ())
+    if page_of.leave_out is not None:
+        end, bounds = f"{end} AND NOT (instr(value, ?) > 0 AND instr(value, ?) = 0)", (*bounds, *page_of.leave_out)
     sql = (
         f"SELECT json_group_array(json_array({columns})) FROM "  # noqa: S608 - texts of ours
         f"(SELECT {source} WHERE key >= ? {end} ORDER BY key LIMIT ?)"
     )
-    first = prefix
+    first = page_of.first or prefix
     while True:
         try:
             (text,) = db.execute(sql, (first, *bounds, most)).fetchone()
@@ -109,6 +142,6 @@ def _rows(
             continue
         page = decoder.decode(text)
         yield from page
-        if len(page) < most:
+        if len(page) < most or page_of.once:
             return
         first = f"{page[-1][0]}\0"  # the next text there is

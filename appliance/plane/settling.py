@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from functools import partial
 
 import structlog
 
@@ -70,23 +69,35 @@ class Settling:
             returned_s: how long of it for members that have come back and are not compared with yet; None: as long.
 
         Returns:
-            Whether it has; False after `SETTLE_S` at most: then it goes on with what it has.
+            Whether it has; False after `SETTLE_S` at most: then it goes on with what it has. False too as soon as the
+            shard is reconciled with a ring in which the key is another's: whoever asked has to ask there.
         """
         if self.mine(key):
             return True
         self.on_wanted()
+
+        def compared() -> bool:
+            return self._compared(key) or self._given_away(key)
+
+        def mine() -> bool:
+            return self.mine(key) or self._given_away(key)
+
         loop = asyncio.get_running_loop()
         until = loop.time() + (SETTLE_S if returned_s is None else returned_s)
         try:
             async with asyncio.timeout(SETTLE_S), self._changed:
-                await self._changed.wait_for(partial(self._compared, key))
+                await self._changed.wait_for(compared)
                 async with asyncio.timeout_at(until):
-                    await self._changed.wait_for(partial(self.mine, key))
+                    await self._changed.wait_for(mine)
         except TimeoutError:
             if returned_s is None or not self._compared(key):
                 log.warning("answering before the shard is reconciled", key=key, waited_s=SETTLE_S)
             return False
-        return True
+        return self.mine(key)
+
+    def _given_away(self, key: str) -> bool:
+        """Whether a key is another gateway's by the ring as it is, with which the shard is reconciled."""
+        return self.reconciled() and self._ring.owner(key) != self._gateway
 
     def met(self) -> bool:
         """Whether the shard is compared with everybody who is there: who began apart may have what is not here."""

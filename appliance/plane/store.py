@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 from appliance.plane.ahead import NOTHING, Mark
 from appliance.plane.commits import Call, Commits
-from appliance.plane.rows import read_digests, read_kept, read_records, read_row
+from appliance.plane.rows import LeaveOut, read_digests, read_kept, read_page, read_records, read_row
 from appliance.plane.versions import Record, digest
 
 T = TypeVar("T")
@@ -105,6 +105,13 @@ class Store:
     async def records(self, prefix: str) -> list[Record]:
         """Return every record with that prefix, tombstones too, in order of keys."""
         return await self._call(partial(read_records, prefix=prefix))
+
+    async def page(self, prefix: str, after: str = "", leave_out: LeaveOut | None = None) -> list[Record]:
+        """Return the next records with that prefix and a key above `after`, in order; none: there are no more.
+
+        Read so, many records do not hold up what else waits for the disk; between pages they may change.
+        """
+        return await self._call(partial(read_page, prefix=prefix, after=after, leave_out=leave_out))
 
     async def digests(self) -> list[tuple[str, str]]:
         """Return (key, digest) of every record, in order of keys."""
@@ -243,6 +250,29 @@ class Store:
         if decided is not None and decided != current:
             self._commits.put(decided, db)
         return decided
+
+    def watch(self, heed: Callable[[str], bool], tell: Callable[[Record], None]) -> Callable[[], None]:
+        """Have `tell` hear, on the event loop and in order, of every record committed from now on whose key is heeded.
+
+        Whoever wrote it: this gateway, another one, or a comparison with other copies. Removals count too.
+
+        Args:
+            heed: whether a key is of interest; called on the store's thread for every record, so it must be quick, must
+                not raise, and may only look at what is safe to read from any thread.
+            tell: hears of the record.
+
+        Returns:
+            What ends it; records on their way to the event loop may still be told.
+        """
+
+        def committed(record: Record) -> None:
+            if heed(record.key):
+                # The loop may be gone when the process ends without closing: then nobody waits.
+                with contextlib.suppress(RuntimeError):
+                    self._loop.call_soon_threadsafe(tell, record)
+
+        self._commits.watchers.append(committed)
+        return lambda: self._commits.watchers.remove(committed)
 
     async def forget(self, record: Record) -> None:
         """Drop a copy that belongs elsewhere, if it is still that version."""

@@ -108,6 +108,18 @@ class Driver:
         return self._keeper.told
 
     @property
+    def overtaken(self) -> bool:
+        """Whether the record has moved on under this driver: it stops, and its copy is no answer to anybody."""
+        return self._keeper.overtaken
+
+    def heard(self, version: VersionVector) -> bool:
+        """Hear that this gateway's copy of the record has changed; returns whether that was somebody else's doing.
+
+        While a write of the driver's own is under way it is not told apart: the driver looks when that returns.
+        """
+        return self._keeper.heard(version)
+
+    @property
     def elapsed_s(self) -> float:
         """Seconds since the task was accepted."""
         return self._keeper.elapsed_s

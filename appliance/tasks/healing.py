@@ -2,7 +2,8 @@
 
 The version that stands says which others lost (`TaskRecord.splits`, made by `resolve`). Its coordinator settles each of
 them once: the highest attempt that either side made becomes the fence below the next one, runs of the other side are
-ended where they are, what they still tell is refused, and people get a notice. A run of the version that stands goes on
+ended where they are, what they still tell is refused, and people get a notice. So does whoever gave an order that only
+a version that lost has carried out: it was answered as done, and is not. A run of the version that stands goes on
 unless the other side has sent a higher attempt of it to a robot: the robot would refuse it, so it is repeated.
 """
 
@@ -13,12 +14,26 @@ import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import SwiftbotError
-from appliance.model import Failure, LostRun, Notice, RunEvent, Split, SubtaskRecord, SubtaskState, TaskRecord, encode
+from appliance.errors import PayloadError, SwiftbotError
+from appliance.model import (
+    Failure,
+    LostOrder,
+    LostRun,
+    Notice,
+    RunEvent,
+    Split,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+    encode,
+)
+from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.bounds import MAX_NOTE, clean
 from appliance.tasks.keeper import Keeper
+from appliance.tasks.resolve import orders_of
 from appliance.tasks.transition import TransitionKind
 
 log = structlog.get_logger(__name__)
@@ -33,14 +48,18 @@ _ACTIVE = (SubtaskState.DISPATCHED, SubtaskState.RUNNING)
 
 
 def unsettled(record: TaskRecord) -> tuple[Split, ...]:
-    """Versions that lost and are not dealt with yet."""
-    return tuple(each for each in record.splits if not each.settled)
+    """Versions that lost and are not dealt with yet, or were dealt with in a version that itself lost later.
+
+    Of the latter the mark that they are settled outlives (`resolve.merged`), and the fences do not: without them a
+    second attempt would be given a number, and its gateway answer with what came of the first.
+    """
+    return tuple(each for each in record.splits if not each.settled or _unfenced(record, each))
 
 
-def unheard(stored: TaskRecord, driven: TaskRecord) -> bool:
-    """Whether a stored record knows of versions that lost of which the one that is driven does not."""
-    known = {(each.coordinator, each.sequence) for each in driven.splits}
-    return any((each.coordinator, each.sequence) not in known for each in unsettled(stored))
+def _unfenced(record: TaskRecord, split: Split) -> bool:
+    """Whether an attempt of a version that lost has a number that the next attempt of this version may be given."""
+    made = {run.subtask: run.attempt for run in sorted(split.runs, key=lambda run: run.attempt)}
+    return any(made.get(each.subtask.id, 0) >= each.next_attempt and not each.state.final for each in record.subtasks)
 
 
 def foreign(record: TaskRecord, event: RunEvent) -> bool:
@@ -67,9 +86,11 @@ class Healing(Struct, frozen=True, kw_only=True):
     superseded: tuple[str, ...]
     """Subtasks of the version that stands whose run is to be repeated under a higher number."""
     notes: tuple[str, ...]
-    """What people are told; none where nothing was doubled."""
+    """What people are told; none where nothing was doubled and no order lost."""
     noted: tuple[str, ...]
-    """Which version each note is about: whoever settles it, it is the same notice."""
+    """Which version or order each note is about: whoever settles it, it is the same notice."""
+    to: tuple[str, ...]
+    """Who each note is for: whoever gave the order that lost, else any operator."""
 
     async def settle(self, plane: Plane, keeper: Keeper) -> None:
         """Write it into the record, then end what is doubled and tell people."""
@@ -77,16 +98,16 @@ class Healing(Struct, frozen=True, kw_only=True):
         await keeper.flush()
         task = keeper.record.id
         await asyncio.gather(*(_end(plane, task, run) for run in self.ends))
-        for name, note in zip(self.noted, self.notes, strict=True):
+        for name, note, to in zip(self.noted, self.notes, self.to, strict=True):
             notice = Notice(
                 id=f"{task}/healed/{name}",
-                to=NOTICED,
+                to=to,
                 text=note,
                 task=task,
                 gateway=plane.gateway,
                 at_ns=time.time_ns(),
             )
-            plane.session.put(plane.keys.notice(NOTICED), encode(notice))
+            plane.session.put(plane.keys.notice(to), encode(notice))
             log.warning("a partition has healed", task=task, note=note)
 
 
@@ -110,6 +131,7 @@ def heal(record: TaskRecord) -> Healing | None:
     settled: list[Split] = []
     notes: list[str] = []
     noted: list[str] = []
+    recipients: list[str] = []
     for split in fresh:
         doubled: list[str] = []
         for run in split.runs:
@@ -123,7 +145,7 @@ def heal(record: TaskRecord) -> Healing | None:
             if own is not None and own.state in _ACTIVE and own.bound_robot and run.attempt > own.attempt:
                 superseded.add(run.subtask)
         note = ""
-        if doubled:
+        if doubled and not split.settled:
             note = clean(
                 f"a partition has healed: task {record.id} had gone on on both sides; the version of "
                 f"{split.coordinator} ({split.state}) lost to that of {record.coordinator} ({record.state}); "
@@ -132,8 +154,20 @@ def heal(record: TaskRecord) -> Healing | None:
             )
             notes.append(note)
             noted.append(f"{split.coordinator}-{split.sequence}")
-        settled.append(replace(split, settled=True, note=note))
-    others = tuple(each for each in record.splits if each.settled)
+            recipients.append(NOTICED)
+        if split.settled:  # people have been told
+            settled.append(split)
+            continue
+        said = [note] if note else []
+        for order in overruled(split, record):
+            name = f"order-{order.act or f'{order.verb}-{order.at_ns}'}"
+            said.append(_lost_order(order, split, record))
+            if name not in noted:  # several versions that lost may descend from the one with the order
+                notes.append(said[-1])
+                noted.append(name)
+                recipients.append(_recipient(order.by))
+        settled.append(replace(split, settled=True, note=clean("; ".join(said), MAX_NOTE)))
+    others = tuple(each for each in record.splits if each not in fresh)
     return Healing(
         splits=tuple(sorted((*others, *settled), key=lambda each: (each.coordinator, each.sequence))),
         fences=fences,
@@ -141,7 +175,41 @@ def heal(record: TaskRecord) -> Healing | None:
         superseded=tuple(sorted(superseded)),
         notes=tuple(notes),
         noted=tuple(noted),
+        to=tuple(recipients),
     )
+
+
+def overruled(split: Split, record: TaskRecord) -> tuple[LostOrder, ...]:
+    """Return the orders of a version that lost which the version that stands neither has nor has had the effect of."""
+    mine = orders_of(record)
+    decision = record.decision
+    stopped = record.state in (TaskState.CANCELLED, TaskState.CANCELLING)
+    effective = {
+        "cancel": stopped,
+        "approve": decision is not None and decision.approved,
+        "reject": stopped or (decision is not None and not decision.approved),
+        "retry": record.retried_by is not None,
+        "pause": any(not each.stop for each in record.pauses),
+    }
+    return tuple(each for each in split.orders if each not in mine and not effective.get(each.verb, False))
+
+
+def _lost_order(order: LostOrder, split: Split, record: TaskRecord) -> str:
+    again = f"; if it is still wanted, give it again: swiftbot task {order.verb} {record.id}"
+    return clean(
+        f"a partition has healed: the {order.verb} of task {record.id} by {order.by or 'an operator'} is void: the "
+        f"version of {split.coordinator} that had it ({split.state}) lost to that of {record.coordinator} "
+        f"({record.state}){'' if record.state.final else again}",
+        MAX_NOTE,
+    )
+
+
+def _recipient(by: str) -> str:
+    """Who hears of a lost order: its operator where the name can be part of a key, else any operator."""
+    try:
+        return check_name(by, "operator")
+    except PayloadError:
+        return NOTICED
 
 
 def _same(own: SubtaskRecord, run: LostRun) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 from appliance.errors import ConflictError, SwiftbotError
 from appliance.model import TaskRecord, VersionVector, encode
 from appliance.plane.node import Plane
+from appliance.plane.versions import descends
 from appliance.tasks import machine
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
@@ -44,6 +45,9 @@ class Keeper:
         self._on_change = on_change
         self._pending: list[Transition] = []
         self._dirty = False
+        self._writing = False
+        self._heard: VersionVector = version
+        """The version of this gateway's copy that was heard of last."""
         self.unknown = Unknown()
         """Fields of the record that this version does not know, and keeps."""
         self.ready_ns: dict[str, int] = {}
@@ -59,6 +63,21 @@ class Keeper:
     def version(self) -> VersionVector:
         """The record's version as it was written last."""
         return self._version
+
+    @property
+    def overtaken(self) -> bool:
+        """Whether the record is known to have moved on under this keeper: what it holds in memory is of the past.
+
+        While a write is under way that is not known, since the copy here is changed by that write before it returns;
+        `flush` looks when it has returned.
+        """
+        return not self._writing and not descends(self._version, self._heard)
+
+    def heard(self, version: VersionVector) -> bool:
+        """Take in the version of this gateway's copy, which has just changed; returns whether it was `overtaken`."""
+        if not descends(self._version, version):
+            self._heard = version
+        return self.overtaken
 
     @property
     def elapsed_s(self) -> float:
@@ -103,7 +122,8 @@ class Keeper:
         One write covers all transitions since the last: a finished subtask and the dispatch of its successors
         become durable together, which takes a replicated write off the successors' start.
         """
-        if self._dirty:
+        if written := self._dirty:
+            self._writing = True
             try:
                 # Every write survives the death of processes. Only an end is synced to disk: what a power cut of
                 # the whole site takes from the middle of a task is done again under the same effect ids.
@@ -115,17 +135,29 @@ class Keeper:
                 )
             except ConflictError:
                 await self._reread()
+            finally:
+                self._writing = False
             self._dirty = False
+        if self.overtaken:
+            # Nothing follows from it, and the record is no news: whoever drives by the one that stands sees to both.
+            # What was written is told all the same: others may have gone on from it, so a log must have it.
+            if written:
+                self._publish()
+            raise SupersededError("the record has changed under it")
         if not self._pending:
             return
         self.on_written()
+        self._publish()
+        self._plane.session.put(self._plane.keys.task(self.record.id), with_unknown(self.record, self.unknown))
+        self.told = self.record
+        self._on_change(self.record)
+
+    def _publish(self) -> None:
+        """Publish the transitions that led to what is written."""
         for transition in self._pending:
             self._plane.session.put(self._plane.keys.transition(self.record.id), encode(transition))
             self.on_published(transition)
         self._pending.clear()
-        self._plane.session.put(self._plane.keys.task(self.record.id), with_unknown(self.record, self.unknown))
-        self.told = self.record
-        self._on_change(self.record)
 
     def take(self, transition: Transition, *, durable: bool = True) -> bool:
         """Apply a transition if it fits; returns whether it did."""
@@ -138,5 +170,11 @@ class Keeper:
         current = await self._plane.dht.read(task_key(self.record.id))
         holder = ""
         if current is not None:
-            holder = read_record(current.value).coordinator
+            found = read_record(current.value)
+            holder = found.coordinator
+            if (holder, found.sequence, found.updated_ns) == (
+                self.record.coordinator, self.record.sequence, self.record.updated_ns,
+            ):  # fmt: skip
+                # It was written, and stands with what another version adds to it: a log must have what led there.
+                self._publish()
         raise SupersededError(f"the record has moved on to {holder or 'nobody'}")

@@ -11,6 +11,8 @@ from appliance.model import TaskRecord
 from appliance.plane.node import Plane
 from appliance.tasks.api import TaskList, TasksAsk
 from appliance.tasks.bounds import read_record
+from appliance.tasks.remembering import TRIMMED
+from appliance.tasks.surroundings import PREFIX
 
 ANSWER_S = 2.0
 
@@ -24,7 +26,8 @@ async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]
         driven: records of tasks that are driven here, which may be newer than those written.
     """
     found: dict[str, TaskRecord] = {}
-    for stored in await plane.dht.local("task/"):
+    # Without what is only remembered: there is too much of it to be shown, or read, each time.
+    for stored in await plane.dht.local(PREFIX, leave_out=TRIMMED):
         if not stored.deleted:
             with contextlib.suppress(PayloadError):
                 record = read_record(stored.value)

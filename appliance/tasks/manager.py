@@ -58,6 +58,7 @@ from appliance.tasks.placement import Placement
 from appliance.tasks.plans import Plans
 from appliance.tasks.questions import Questions
 from appliance.tasks.recovery import Recovery
+from appliance.tasks.remembering import answered
 from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.steering.api import CancelTaskAsk, PlanCheckAsk
@@ -190,7 +191,7 @@ class TaskManager:
     async def submit(self, request: TaskRequest) -> TaskRecord:
         """Accept a task wherever its key belongs; durable when this returns.
 
-        A request with an `id` that is known is the same task: its record is returned.
+        A request with an `id` that is known is the same task: its record is returned, or what is remembered of it.
 
         Raises:
             PayloadError: empty or oversize instruction, bad id.
@@ -245,7 +246,7 @@ class TaskManager:
         except ConflictError:
             # Known already; perhaps by a first try whose answer was lost before it was driven.
             self._sweep.set()
-            return await self.task(TaskAsk(id=request.id))
+            return answered(await self.task(TaskAsk(id=request.id)), request)
         self.plane.session.put(self.plane.keys.transition(record.id), encode(transition))
         self.recovery.published(transition)
         self.plane.session.put(self.plane.keys.task(record.id), encode(record))

@@ -45,8 +45,13 @@ class Questions:
         self._sweep = sweep
 
     async def task(self, ask: TaskAsk) -> TaskRecord:
-        """Return a task's record; NotFoundError when there is none."""
-        if driver := self._drivers.get(ask.id):
+        """Return a task's record; NotFoundError when there is none.
+
+        A driver's copy is the answer only where the record is this gateway's and has not changed under the driver:
+        after a partition the other side's may stand.
+        """
+        driver = self._drivers.get(ask.id)
+        if driver is not None and not driver.overtaken and self._plane.dht.owns(task_key(ask.id)):
             return driver.told
         stored = await self._plane.dht.read(task_key(check_name(ask.id, "task")))
         if stored is None or stored.deleted:

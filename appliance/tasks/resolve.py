@@ -10,7 +10,7 @@ people told; that too comes out the same in whatever order the versions meet.
 
 import msgspec
 
-from appliance.model import LostRun, Split, SubtaskState, TaskRecord, encode
+from appliance.model import LostOrder, LostRun, Split, SubtaskState, TaskRecord, encode
 from appliance.plane.dht import Record
 from appliance.pool import lineage
 from appliance.tasks import checkpoints
@@ -55,6 +55,24 @@ def split_of(record: TaskRecord) -> Split:
             for each in record.subtasks
             if each.attempt
         ),
+        orders=orders_of(record),
+    )
+
+
+def orders_of(record: TaskRecord) -> tuple[LostOrder, ...]:
+    """Return the operators' orders that a record shows to be carried out, the last of each kind.
+
+    Not a `resume`: it leaves nothing in the record but the absence of the pause.
+    """
+    decision = record.decision
+    said = [
+        ("cancel", record.cancelled_by),
+        ("retry", record.retried_by),
+        ("approve" if decision is not None and decision.approved else "reject", decision),
+        *(("pause", each) for each in record.pauses if not each.stop),
+    ]
+    return tuple(
+        LostOrder(verb=verb, by=word.by, act=word.act, at_ns=word.at_ns) for verb, word in said if word is not None
     )
 
 

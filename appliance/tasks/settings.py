@@ -48,7 +48,14 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     retention_s: float = 60.0
     """How often old records are looked for."""
     keep_finished: int = 500
-    """Finished task records kept in this gateway's shard."""
+    """Finished task records kept whole in this gateway's shard; of older ones the id and the outcome are remembered."""
+    remember_days: Annotated[float, Meta(ge=0, le=365)] = 7.0
+    """How long after its end the id of a task whose record was trimmed is remembered with its outcome, days: handed in
+    again it is answered with that and not done again. A week: longer than a script or a store-and-forward link repeats
+    a request. 0: not at all."""
+    remember_most: Annotated[int, Meta(ge=0, le=100_000)] = 5000
+    """Ids remembered so in this gateway's shard, some 400 B each; beyond it the oldest are forgotten before their time,
+    which is counted (`forgotten` in the gateway's status) and said in the log."""
     tell_decisions: bool = True
     """Put each placement with all that it rested on, so that `swiftbot log check` can make it again: 1 kB a subtask."""
     approval: Approval = Approval.NEVER

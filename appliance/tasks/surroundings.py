@@ -30,6 +30,9 @@ from appliance.tasks.settings import TasksConfig
 from appliance.tasks.steering.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
 from appliance.tasks.transition import Transition
 
+PREFIX = "task/"
+"""Of the keys of task records in the DHT."""
+
 
 class Recovering(Protocol):
     """What finding runs that go wrong and revising plans needs; `tasks.recovery` provides it."""
@@ -275,7 +278,7 @@ def figures(plane: Plane, gateway: str) -> dict[str, Any]:
 
 def task_key(task: str) -> str:
     """Key of a task's record in the DHT."""
-    return f"task/{task}"
+    return f"{PREFIX}{task}"
 
 
 def need_of(manifest: SkillManifest) -> Need:

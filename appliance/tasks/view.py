@@ -8,6 +8,7 @@ from typing import Any
 from msgspec import Struct
 
 from appliance.model import Decision, Failure, Group, Proposal, Revision, SubtaskRecord, TaskRecord, Word
+from appliance.tasks.remembering import done_text
 from appliance.tasks.why import waits_for
 
 
@@ -81,6 +82,8 @@ class TaskView(Struct, frozen=True, kw_only=True):
     subtasks: tuple[SubtaskView, ...]
     notes: tuple[str, ...]
     """What people should know of its course: what a partition doubled, and what was done about it."""
+    done: str | None
+    """Of a task whose record was trimmed: when it was done, and where its details are."""
 
 
 def view(record: TaskRecord) -> TaskView:
@@ -111,7 +114,11 @@ def view(record: TaskRecord) -> TaskView:
         cancelled_by=record.cancelled_by,
         retried_by=record.retried_by,
         subtasks=tuple(_subtask(each) for each in record.subtasks),
-        notes=tuple(each.note for each in record.splits if each.note),
+        notes=(
+            *(each.note for each in record.splits if each.note),
+            *([record.note] if record.remembered is not None and record.note else []),
+        ),
+        done=done_text(record) or None,
     )
 
 

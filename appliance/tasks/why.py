@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from appliance.errors import NotFoundError
 from appliance.model import PLAIN_PRIORITY, Attempt, Choice, Failure, Group, SubtaskRecord, TaskRecord, TaskState
+from appliance.tasks.remembering import done_text
 
 WAITS = "waits for "
 """How the note of a subtask begins that waits for something outside of the task."""
@@ -82,12 +83,15 @@ class TaskWhy(Struct, frozen=True, kw_only=True):
     """The gateways that serve it, its root, and how that came about."""
     waits: str = ""
     """What the task or subtasks of it wait for: an operator's approval, the end of a pause, a robot that was lost."""
+    done: str = ""
+    """Of a task whose record was trimmed: when it was done, and where its details are."""
 
 
 def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
     """Return the reasons of a task, or of one of its subtasks; NotFoundError when the plan has none of that id."""
+    done = done_text(record)
     chosen = [each for each in record.subtasks if subtask in ("", each.subtask.id)]
-    if subtask and not chosen:
+    if subtask and not chosen and not done:
         known = ", ".join(each.subtask.id for each in record.subtasks)
         raise NotFoundError(
             f"task {record.id} has no subtask {subtask[:60]!r}", remedy=f"it has: {known or 'none, it is not planned'}"
@@ -103,6 +107,7 @@ def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
         note=record.note,
         group=record.group,
         waits=waits_for(record),
+        done=done,
     )
 
 

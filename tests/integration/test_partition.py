@@ -15,16 +15,18 @@ from pathlib import Path
 import pytest
 from fleets import RULES
 from moving_bench import counting, ended, pretty, write_skills
+from msgspec.structs import replace
 
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
-from appliance.model import Notice, TaskState
+from appliance.model import Approval, Notice, TaskRecord, TaskState
 from appliance.plane.router import run_router
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
+from appliance.tasks.api import TaskAsk
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.settings import TasksConfig
 
@@ -209,3 +211,59 @@ async def doubled(here: FleetClient, there: FleetClient, task: str) -> bool:
     """Whether a task has a run of its own in each half."""
     one, other = await here.task(task), await there.task(task)
     return one.subtasks[0].gateway in NAMES[:2] and other.subtasks[0].gateway in NAMES[2:]
+
+
+async def asked_of(client: FleetClient, task: str) -> dict[str, TaskState]:
+    """Return what each gateway that a client sees answers of a task."""
+    members = sorted(client.plane.members())
+    answers = [await client.plane.rpc.call(name, "task", TaskAsk(id=task), TaskRecord) for name in members]
+    return dict(zip(members, (each.state for each in answers), strict=True))
+
+
+async def test_what_one_half_decides_is_what_all_answer_once_they_meet(tmp_path: Path) -> None:
+    """Plans that wait when the link is cut: approved, cancelled, or both; then all gateways say the same of each.
+
+    Nobody goes on waiting for an approval that was given; whoever cancelled what the other half has finished is told.
+    """
+    async with halves(tmp_path) as (relay, here, there):
+        here.operator, there.operator = "ann", "bob"
+        notices: asyncio.Queue[Notice] = asyncio.Queue()
+        here.on_notice(notices)
+        tasks = {f"t-{kind}-{number}": kind for kind in ("approved", "cancelled", "both") for number in range(4)}
+        waiting: dict[str, TaskRecord] = {}
+        for task in tasks:
+            await here.submit(replace(counting(task, steps=2), approval=Approval.ALWAYS))
+            waiting[task] = await here.planned(task)
+            assert waiting[task].state is TaskState.PROPOSED
+        await relay.cut()
+        await until_seen(here, set(NAMES[:2]))
+        await until_seen(there, set(NAMES[2:]))
+        for task, kind in tasks.items():
+            if kind != "approved":
+                await here.cancel(task)
+            if kind != "cancelled":
+                proposal = waiting[task].proposal
+                assert proposal is not None
+                await there.approve(task, plan_hash=proposal.hash)
+                assert (await ended(there, task)).state is TaskState.SUCCEEDED
+        for task, kind in tasks.items():
+            assert (await here.task(task)).state is (TaskState.PROPOSED if kind == "approved" else TaskState.CANCELLED)
+        await relay.mend()
+        await until_seen(here, set(NAMES))
+        await until_seen(there, set(NAMES))
+        expected = {
+            task: TaskState.CANCELLED if kind == "cancelled" else TaskState.SUCCEEDED for task, kind in tasks.items()
+        }
+        async with asyncio.timeout(60):
+            for task, state in expected.items():
+                while set((await asked_of(here, task)).values()) != {state}:
+                    await asyncio.sleep(0.1)
+            told: set[str] = set()
+            lost = {task for task, kind in tasks.items() if kind == "both"}
+            while told != lost:
+                notice = await notices.get()
+                if "the cancel of task" in notice.text:
+                    assert notice.to == "ann", notice
+                    told.add(notice.task)
+        for task, state in expected.items():
+            assert set((await asked_of(there, task)).values()) == {state}, "and it stays so"

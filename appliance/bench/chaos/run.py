@@ -18,11 +18,14 @@ from typing import Any
 import msgspec
 
 from appliance.bench.chaos import account, plan
+from appliance.bench.chaos import sides as both_sides
 from appliance.bench.chaos.account import Down, Follower, Submitted
 from appliance.bench.chaos.arena import Arena, Progress, Site, loopback
 from appliance.bench.chaos.ledger import LedgerFile, LedgerRobot
 from appliance.bench.chaos.outages import Conditions, carry_out
+from appliance.bench.chaos.partition import AGREE_S, Partitions
 from appliance.bench.net import space
+from appliance.bench.net.faults import Phase, phases
 from appliance.bench.pooled import fleet_name, write_skill
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, SwiftbotError
@@ -34,6 +37,8 @@ from appliance.tasks.check import check
 from appliance.tasks.machine import Transition
 
 ROBOTS = 4
+CUTS_S = (5.0, 20.0, 60.0)
+"""How long the partitions of a run last: one shorter than what follows from a loss, one longer, and a long one."""
 MANIFEST = """
 id = "bench_ledger"
 domain = "coordination"
@@ -92,6 +97,14 @@ class Options(Conditions, frozen=True, kw_only=True):
     """How long tasks may take to end once everybody is up again."""
     containers: int = 1
     """Kept ready by each gateway."""
+    orders: int = 1
+    """Rounds of orders on both sides of each partition (`sides.KINDS`): 11 tasks a round."""
+
+    def phases(self) -> tuple[Phase, ...]:
+        """The faults of the network with their times; a partition comes several times, short and long."""
+        return tuple(
+            phases(self.faults, self.names(), fault_s=self.fault_s, rest_s=self.rest_s, seed=self.seed, cuts_s=CUTS_S)
+        )
 
 
 class Trial:
@@ -103,6 +116,7 @@ class Trial:
         self.options = options
         self.arena = arena
         self.client = client
+        self.observer = observer
         self.file = file
         self.follower = Follower()
         self.submitted: dict[str, Submitted] = {}
@@ -271,10 +285,14 @@ async def _on_a_bad_wire(options: Options, *, progress: Progress) -> dict[str, A
         space.net(names, seed=options.seed) as wire,
         trial(options, progress=progress, sites=wire.sites, sides=sides) as it,
     ):
-        faults = space.disturb(wire, planned, time.monotonic(), progress)
-        result = await _run(it, faults, seconds=seconds, progress=progress)
+        began = time.monotonic()
+        partitions = Partitions(
+            it.observer, gateways=names, planned=planned, robots=robots(), rounds=options.orders, seed=options.seed
+        )
+        faults = space.disturb(wire, planned, began, progress, noted=partitions.noted)
+        result = await _run(it, faults, seconds=seconds, progress=progress, partitions=partitions)
         folder = it.arena.directory
-    result["faults"] = {each.name: each.until_s - each.at_s for each in planned}
+    result["faults"] = [{"fault": each.name, "seconds": each.until_s - each.at_s} for each in planned]
     result["sides"] = sides
     return await asyncio.to_thread(keep, result, folder, asked=bool(options.keep))
 
@@ -284,7 +302,12 @@ async def _nothing() -> dict[str, int]:
 
 
 async def _run(
-    it: Trial, faults: Coroutine[Any, Any, dict[str, int]], *, seconds: float, progress: Progress
+    it: Trial,
+    faults: Coroutine[Any, Any, dict[str, int]],
+    *,
+    seconds: float,
+    progress: Progress,
+    partitions: Partitions | None = None,
 ) -> dict[str, Any]:
     options = it.options
     wanted = plan.tasks(
@@ -297,31 +320,46 @@ async def _run(
         group.create_task(it.submit(wanted, began))
         group.create_task(carry_out(it.arena, planned, began, progress=progress, noted=it.noted))
         disturbing = group.create_task(faults)
-    result = await judge(it, wanted, progress=progress)
+        if partitions is not None:
+            group.create_task(partitions.run(began, progress))
+    if partitions is not None:
+        await partitions.clear()
+    result = await judge(it, wanted, partitions=partitions, progress=progress)
     if frames := disturbing.result():
         result["frames"] = frames
     return result | {"gateways": options.gateways, "seconds": round(seconds, 1), "seed": options.seed}
 
 
-async def judge(it: Trial, wanted: Sequence[plan.Wanted], *, progress: Progress) -> dict[str, Any]:
-    """Wait for the ends, then check the invariants."""
+async def judge(
+    it: Trial, wanted: Sequence[plan.Wanted], *, progress: Progress, partitions: Partitions | None = None
+) -> dict[str, Any]:
+    """Wait for the ends, then check the invariants; `partitions`: with what was ordered on both sides of them."""
     began = time.monotonic()
-    await it.ended(wanted, wait_s=it.options.settle_s, progress=progress)
+    contested = partitions.handed_in() if partitions is not None else []
+    await it.ended([*wanted, *contested], wait_s=it.options.settle_s, progress=progress)
     settled_s = time.monotonic() - began
     accepted = {task for task, each in it.submitted.items() if each.accepted}
     records = {each.task: await it.record(each.task, patient=each.task in accepted) for each in wanted}
     submitted = [it.submitted[each.task] for each in wanted]
     tasks = account.outcomes(submitted, records)
+    found: dict[str, Any] = {}
+    if partitions is not None and partitions.cuts:
+        kept = {each.task: await it.record(each.task, patient=True) for each in contested}
+        found["partitions"] = both_sides.account(partitions.cuts, kept, partitions.notices)
+        records |= kept
+        wanted = (*wanted, *partitions.wanted)
     effects = account.effects(wanted, records, it.file.read())
     broken = [
         *(f"{len(tasks[kind])} {kind}" for kind in ("missing", "open", "failed") if tasks[kind]),
         *(f"{effects[kind]} effects {kind}" for kind in ("doubled", "lost", "early", "strange") if effects[kind]),
+        *(both_sides.broken(found["partitions"], within_s=AGREE_S) if found else ()),
     ]
     return {
         "held": not broken,
         "broken": broken,
         "tasks": tasks,
         "effects": effects,
+        **found,
         "downtime": account.downtime(it.follower.downs),
         "takeovers": sum(it.follower.takeovers.values()),
         "tasks_taken_over": len(it.follower.takeovers),

@@ -37,7 +37,8 @@ def due_s(rule: Rule, now_s: float, generator: random.Random) -> float | None:
 Table = dict[str, dict[str, Rule]]
 """From port, to port; what is not in it is clean."""
 
-FAULTS = ("loss", "delay", "reorder", "oneway", "partition")
+PARTITION = "partition"
+FAULTS = ("loss", "delay", "reorder", "oneway", PARTITION)
 
 
 class Phase(Struct, frozen=True, kw_only=True):
@@ -91,7 +92,13 @@ def table_of(
 
 
 def phases(
-    faults: Sequence[str], gateways: Sequence[str], *, fault_s: float, rest_s: float, seed: int
+    faults: Sequence[str],
+    gateways: Sequence[str],
+    *,
+    fault_s: float,
+    rest_s: float,
+    seed: int,
+    cuts_s: Sequence[float] = (),
 ) -> tuple[Phase, ...]:
     """Return the faults one after the other, with rests between them, the same for the same seed.
 
@@ -101,13 +108,16 @@ def phases(
         fault_s: how long each lasts; 0: as long as `FAULT_S` says.
         rest_s: how long the wire is clean before each, and at the end.
         seed: of who is cut off.
+        cuts_s: how long each of several partitions lasts, between the same sides, where `fault_s` does not say it.
     """
     generator = random.Random(seed)  # noqa: S311 - a mixture, not secrets
     found: list[Phase] = []
     at_s = rest_s
     for fault in faults:
         table, sides = table_of(fault, gateways, generator=generator)
-        until_s = at_s + (fault_s or FAULT_S[fault])
-        found.append(Phase(name=fault, at_s=at_s, until_s=until_s, table=table, sides=sides))
-        at_s = until_s + rest_s
+        lengths = cuts_s if fault == PARTITION and cuts_s and not fault_s else (fault_s or FAULT_S[fault],)
+        for length_s in lengths:
+            until_s = at_s + length_s
+            found.append(Phase(name=fault, at_s=at_s, until_s=until_s, table=table, sides=sides))
+            at_s = until_s + rest_s
     return tuple(found)

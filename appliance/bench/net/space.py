@@ -91,15 +91,27 @@ class Net:
         return msgspec.json.decode(line, type=dict[str, int])
 
 
-async def disturb(it: Net, planned: Sequence[Phase], began: float, progress: Callable[[str], None]) -> dict[str, int]:
-    """Make the wire bad as planned, from `began` (monotonic) on; returns what became of the frames meanwhile."""
+async def disturb(
+    it: Net,
+    planned: Sequence[Phase],
+    began: float,
+    progress: Callable[[str], None],
+    *,
+    noted: Callable[[Phase], Callable[[], None]] = lambda _: lambda: None,
+) -> dict[str, int]:
+    """Make the wire bad as planned, from `began` (monotonic) on; returns what became of the frames meanwhile.
+
+    `noted` is called as a fault begins; what it returns, when the wire is good again.
+    """
     before = await it.set({})
     for phase in planned:
         await asyncio.sleep(max(0.0, began + phase.at_s - time.monotonic()))
         progress(f"{phase.name} for {phase.until_s - phase.at_s:g} s")
         await it.set(phase.table)
+        over = noted(phase)
         await asyncio.sleep(max(0.0, began + phase.until_s - time.monotonic()))
         await it.set({})
+        over()
     after = await it.set({})
     return {each: after[each] - before.get(each, 0) for each in after}
 

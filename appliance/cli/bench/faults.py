@@ -30,13 +30,18 @@ def chaos(
     gateways: int = 8,
     every_s: float | None = None,
     freezes: float = 0.2,
+    orders: int = 1,
     network: Network = GOOD,
     as_json: Json = False,
 ) -> int:
     """Tasks with counted effects on gateways that are killed, stopped and started again: is anything lost or doubled?
 
-    Ends with 1 when a task that was accepted did not end, or an effect is missing or there twice; then the folder
-    with the MCAP log and the ledger is kept and named.
+    With `--faults partition` the gateways are cut into two halves for 5, 20 and 60 s, and operators on both sides
+    approve, cancel and submit tasks meanwhile: afterwards every gateway has to answer the same for every task within 1 s.
+
+    Ends with 1 when a task that was accepted did not end, an effect is missing or there twice, gateways answer
+    differently after a partition, or an order was lost without a notice; then the folder with the MCAP log and the ledger
+    is kept and named.
 
     Args:
         minutes: How long gateways go down; with faults of the network their times count.
@@ -44,6 +49,7 @@ def chaos(
         gateways: Gateways, each a process.
         every_s: Mean time between outages, seconds, 0 for none; by default 4, and none with faults of the network.
         freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
+        orders: Rounds of orders on both sides of each partition, 11 tasks a round.
     """
     from appliance.bench.chaos.run import Options, run
 
@@ -51,7 +57,7 @@ def chaos(
     options = Options(
         gateways=gateways, tasks=tasks, seconds=minutes * 60, down_at_once=network.down_at_once, freezes=freezes,
         seed=network.seed, every_s=every_s if every_s is not None else 0.0 if named else 4.0, faults=named,
-        fault_s=network.fault_s, rest_s=network.rest_s, keep=network.keep,
+        fault_s=network.fault_s, rest_s=network.rest_s, keep=network.keep, orders=orders,
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)

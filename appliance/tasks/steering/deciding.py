@@ -10,6 +10,7 @@ from appliance.errors import ConflictError, NotFoundError, RefusedError
 from appliance.llm.checks.schema import able, is_unnamed
 from appliance.model import Approval, Plan, Proposal, RobotInfo, Subtask, SubtaskState, TaskRecord, TaskState
 from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.remembering import refuse_trimmed
 from appliance.tasks.revising import ACTIVE
 from appliance.tasks.steering.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
 from appliance.tasks.steering.hashing import SHORTEST, matches
@@ -129,6 +130,7 @@ def may_retry(record: TaskRecord, ask: RetryAsk) -> bool:
     """
     if ask.act and record.retried_by is not None and record.retried_by.act == ask.act:
         return False
+    refuse_trimmed(record)
     target = None
     if ask.subtask:
         try:

@@ -91,3 +91,17 @@ async def test_those_never_compared_with_are_waited_for_a_moment(monkeypatch: py
     await here.settled(membership.ring, 0)
     await waiting
     assert here.met()
+
+
+async def test_a_request_for_a_key_that_is_given_away_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Members of a partition come back one by one: a key owned for a moment is another's once the last has come."""
+    monkeypatch.setattr(settling, "SETTLE_S", 3600.0)
+    here, membership, _ = _settling()
+    membership.ring = Ring(("a",), virtual_nodes=8)
+    waiting = asyncio.create_task(here.until_mine(OTHERS))
+    await asyncio.sleep(0.02)
+    membership.ring = RING
+    assert not waiting.done()
+    await here.settled(RING, 0)
+    async with asyncio.timeout(60):
+        assert not await waiting

@@ -366,3 +366,40 @@ async def test_what_is_not_in_memory_is_read_from_the_file(tmp_path: Path) -> No
     await store.forget(_record("k"))
     assert store.look("k") == (True, None)
     await store.close()
+
+
+async def test_whoever_watches_a_key_hears_of_each_commit_of_it_in_order(tmp_path: Path) -> None:
+    """By whichever way it is written, removals too; of other keys nothing, and nothing once it is ended."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    heard: asyncio.Queue[Record] = asyncio.Queue()
+    ended = store.watch(lambda key: key == "task/1", heard.put_nowait)
+    written = [_record("task/1", b"a"), _record("task/1", b"b", 2), _record("task/1", b"", 3, deleted=True)]
+    await store.change("task/2", lambda _: _record("task/2"))
+    await store.change("task/1", lambda _: written[0])
+    decided, committed = store.change_soon("task/1", lambda _: written[1])
+    await decided
+    await committed
+    await store.change("task/1", lambda current: current)  # nothing changes
+    await asyncio.gather(*(store.change(f"task/{each}", lambda _: written[2]) for each in (1,)), store.put("k", b"v"))
+    async with asyncio.timeout(60):
+        assert [await heard.get() for _ in written] == written
+    ended()
+    await store.change("task/1", lambda _: _record("task/1", b"c", 4))
+    await store.close()
+    assert heard.empty()
+
+
+async def test_records_are_read_page_by_page(tmp_path: Path) -> None:
+    """All with the prefix, each once and in order, however many there are and however long; others stay out."""
+    store = await Store.open(tmp_path / "s.sqlite")
+    wanted = [_record(f"task/{number:05}", b"x" * (number % 7)) for number in range(1200)]
+    beside = [_record("tas"), _record("task0"), _record("tasl/1")]
+    await asyncio.gather(*(store.change(each.key, lambda _, each=each: each) for each in (*wanted, *beside)))
+    found: list[Record] = []
+    pages = 0
+    while page := await store.page("task/", found[-1].key if found else ""):
+        found += page
+        pages += 1
+    assert found == wanted
+    assert pages > 1
+    await store.close()

@@ -10,9 +10,10 @@ import msgspec
 
 from appliance.errors import ConflictError, SwiftbotError, UnreachableError
 from appliance.model import Plan, TaskRecord, VersionVector
-from appliance.plane.dht import Record
+from appliance.plane.dht import LeaveOut, Record
 from appliance.plane.keys import Keys
 from appliance.plane.session import Message
+from appliance.plane.versions import increment
 from tests.unit.tasks.sample_records import accepted, plan_of
 
 
@@ -96,6 +97,7 @@ class FakeDht:
         self.on_ring_change: list[Callable[[], None]] = []
         self.resolver: object = None
         self.writes = 0
+        self.watchers: list[tuple[Callable[[str], bool], Callable[[Record], None]]] = []
 
     async def read(self, key: str) -> Record | None:
         """Return a record."""
@@ -113,9 +115,23 @@ class FakeDht:
         if (current.version if current else None) != expected:
             raise ConflictError(f"{key} has moved on")
         self.writes += 1
-        version = {self.gateway: self.writes}
-        self.records[key] = Record(key=key, value=value, version=version)
+        version = increment(current.version if current else {}, self.gateway)
+        self.change(Record(key=key, value=value, version=version))
+        await asyncio.sleep(0)  # the copy is known here before the writer hears that it is done
         return version
+
+    def change(self, record: Record) -> None:
+        """Have a copy change, as by a write or by a comparison with another gateway's, and tell who watches it."""
+        self.records[record.key] = record
+        for heed, tell in tuple(self.watchers):
+            if heed(record.key):
+                asyncio.get_running_loop().call_soon(tell, record)
+
+    def watch(self, heed: Callable[[str], bool], tell: Callable[[Record], None]) -> Callable[[], None]:
+        """Have changes told."""
+        watcher = (heed, tell)
+        self.watchers.append(watcher)
+        return lambda: self.watchers.remove(watcher)
 
     async def remove(self, key: str, *, expected: VersionVector) -> None:
         """Remove, if it has not moved on."""
@@ -124,10 +140,13 @@ class FakeDht:
             raise ConflictError(f"{key} has moved on")
         del self.records[key]
 
-    async def local(self, prefix: str) -> list[Record]:
+    async def local(self, prefix: str, *, leave_out: LeaveOut | None = None) -> list[Record]:
         """Return the shard."""
         await asyncio.sleep(0)
-        return [record for key, record in self.records.items() if key.startswith(prefix)]
+        found = [record for key, record in self.records.items() if key.startswith(prefix)]
+        if leave_out is None:
+            return found
+        return [each for each in found if not (leave_out.has in each.value and leave_out.lacks not in each.value)]
 
     def owns(self, key: str) -> bool:
         """Whether all keys are ours."""

@@ -3,19 +3,24 @@
 import asyncio
 from typing import Any
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from appliance.model import (
     Attempt,
+    Decision,
+    LostOrder,
     LostRun,
     Notice,
+    Pause,
     RunEvent,
     RunEventKind,
     Split,
     SubtaskState,
     TaskRecord,
     TaskState,
+    Word,
     encode,
 )
 from appliance.plane.dht import Record
@@ -23,6 +28,7 @@ from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.healing import foreign, heal
 from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import apply
+from appliance.tasks.resolve import merged, split_of
 from appliance.tasks.surroundings import RunNews, task_key
 from appliance.tasks.transition import Transition, TransitionKind
 
@@ -142,3 +148,87 @@ async def test_an_ended_task_tells_what_went_on_elsewhere(plane: Any) -> None:
     await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
     assert [(gateway, verb) for gateway, verb, _ in plane.rpc.calls] == [("gw-3", "run_cancel")]
     assert plane.session.sent(plane.keys.task(), TaskRecord)[-1].splits[0].settled
+
+
+def met(plane: Any, one: TaskRecord, other: TaskRecord) -> TaskRecord:
+    """What stands when two versions meet, the same whichever hears of the other."""
+    value = merged(encode(one), encode(other))
+    assert value == merged(encode(other), encode(one))
+    return msgspec.json.decode(value, type=TaskRecord)
+
+
+CANCEL = Word(by="ann", why="wrong room", act="o-1", at_ns=5)
+
+
+async def test_whoever_gave_an_order_that_lost_gets_a_notice(plane: Any) -> None:
+    """A cancel was answered as done on one side, the other went on to the end: its operator is told, once."""
+    base = record_of(plane)
+    cancelled = replace(base, state=TaskState.CANCELLED, cancelled_by=CANCEL, coordinator="gw-2", sequence=5)
+    done = tuple(replace(each, state=SubtaskState.SUCCEEDED) for each in base.subtasks)
+    succeeded = replace(base, state=TaskState.SUCCEEDED, subtasks=done, sequence=4)
+    record = met(plane, cancelled, succeeded)
+    assert record.state is TaskState.SUCCEEDED
+    healing = heal(record)
+    assert healing is not None
+    plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(record), version={"gw-1": 7})
+    await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
+    (notice,) = plane.session.sent(plane.keys.notice("ann"), Notice)
+    assert "the cancel of task t-1 by ann is void" in notice.text
+    assert "(succeeded)" in notice.text
+    assert notice.id == "t-1/healed/order-o-1", "the same whoever tells it"
+    settled = msgspec.json.decode(plane.dht.records[task_key("t-1")].value, type=TaskRecord)
+    assert "void" in settled.splits[0].note
+    assert heal(settled) is None
+
+
+@pytest.mark.parametrize(
+    ("lost", "stands", "told"),
+    [
+        ({"cancelled_by": CANCEL}, {}, True),
+        ({"cancelled_by": CANCEL}, {"cancelled_by": CANCEL}, False),
+        ({"cancelled_by": CANCEL}, {"state": TaskState.CANCELLING}, False),
+        ({"decision": Decision(approved=True, by="ann", act="o-2")}, {}, True),
+        ({"decision": Decision(approved=True, by="ann")}, {"decision": Decision(approved=True, by="bob")}, False),
+        ({"decision": Decision(approved=False, by="ann")}, {"decision": Decision(approved=True, by="bob")}, True),
+        ({"retried_by": CANCEL}, {}, True),
+        ({"pauses": (Pause(by="ann", act="o-3"),)}, {}, True),
+        ({"pauses": (Pause(by="ann", act="o-3"),)}, {"pauses": (Pause(by="bob", act="o-4"),)}, False),
+        ({"pauses": (Pause(by="ann", stop="s-1"),)}, {}, False),
+    ],
+)
+def test_an_order_is_lost_unless_what_stands_has_its_effect(
+    plane: Any, lost: dict[str, Any], stands: dict[str, Any], told: bool
+) -> None:
+    """Two operators who wanted the same have both got it; what a soft stop did is no operator's order of the task."""
+    base = record_of(plane)
+    split = split_of(replace(base, coordinator="gw-2", sequence=5, **lost))
+    healing = heal(replace(base, splits=(split,), **stands))
+    assert healing is not None
+    assert bool(healing.notes) is told
+    assert healing.to == (("ann",) if told else ())
+
+
+def test_an_operator_whose_name_is_no_key_is_told_as_an_operator(plane: Any) -> None:
+    """A name with blanks cannot be part of a key: the notice goes to all, with the name in its text."""
+    order = LostOrder(verb="cancel", by="Ann of the night shift", at_ns=3)
+    healing = heal(record_of(plane, replace(split(), orders=(order,))))
+    assert healing is not None
+    assert (healing.to, healing.noted) == (("operator",), ("order-cancel-3",))
+    assert "by Ann of the night shift" in healing.notes[0]
+
+
+def test_fences_survive_the_loss_of_the_version_that_set_them(plane: Any) -> None:
+    """Settled in a version that lost in its turn: no number is given twice, runs are ended, nobody is told twice."""
+    settled = replace(split(lost(3, "gw-3")), settled=True, note="told")
+    record = record_of(plane, settled)
+    healing = heal(record)
+    assert healing is not None
+    assert healing.fences == {"s1": 3}
+    assert [(each.attempt, each.gateway) for each in healing.ends] == [(3, "gw-3")]
+    assert (healing.notes, healing.splits) == ((), (settled,))
+    after = apply(record, _step(4, TransitionKind.HEALED, splits=healing.splits, fences=healing.fences))
+    assert after.subtasks[0].next_attempt == 4
+    assert heal(after) is None
+    assert heal(record_of(plane, replace(split(lost(1, "gw-3")), settled=True))) is None, "below its own: fenced off"
+    done = replace(record.subtasks[0], state=SubtaskState.SUCCEEDED)
+    assert heal(replace(record, subtasks=(done,))) is None, "there will be no next attempt"

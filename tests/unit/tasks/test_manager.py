@@ -18,7 +18,9 @@ from appliance.llm.review import Review
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.model import (
+    Approval,
     Attempt,
+    Decision,
     Plan,
     PoolHint,
     RobotInfo,
@@ -39,10 +41,13 @@ from appliance.plane.dht import Record
 from appliance.pool.api import Hinted
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import driving as module
-from appliance.tasks.api import RunStatus, TaskAsk
+from appliance.tasks import machine
+from appliance.tasks.api import RunStatus, TaskAsk, TasksAsk, WhyAsk
 from appliance.tasks.bounds import read_record
+from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
+from appliance.tasks.remembering import trimmed
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.steering.api import CancelTaskAsk, RetryAsk
 
@@ -157,7 +162,7 @@ async def test_a_broken_sweep_and_poisoned_records_do_not_end_takeover(manager: 
     await asyncio.sleep(0.02)
     working = plane.dht.local
 
-    async def broken(prefix: str) -> list[Any]:
+    async def broken(prefix: str, **_: object) -> list[Any]:
         raise OSError("the disk is gone")
 
     plane.dht.local = broken
@@ -396,3 +401,69 @@ async def test_a_cancel_answers_with_the_state_that_came_of_it(manager: TaskMana
     assert answer.state is TaskState.CANCELLED
     assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
     assert (await manager.cancel(CancelTaskAsk(id="t-1"))).cancelled_by == answer.cancelled_by, "asked again: the same"
+
+
+async def waiting(manager: TaskManager, plane: Any) -> Record:
+    """Have a task wait for approval of its plan; returns its record as it is stored."""
+    await manager.submit(replace(wish(plane), approval=Approval.ALWAYS))
+    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"].told.state is TaskState.PROPOSED)
+    return plane.dht.records["task/t-1"]
+
+
+@pytest.mark.parametrize("state", [TaskState.SUCCEEDED, TaskState.CANCELLED])
+async def test_a_coordinator_follows_the_record_that_changes_under_it(
+    manager: TaskManager, plane: Any, state: TaskState
+) -> None:
+    """The other side of a partition has ended the task: it is answered and published so at once, and driven no more."""
+    stored = await waiting(manager, plane)
+    other = replace(read_record(stored.value), state=state, coordinator="gw-2", sequence=9)
+    told = len(plane.session.puts)
+    plane.dht.change(Record(key=stored.key, value=encode(other), version={**stored.version, "gw-2": 5}))
+    await asyncio.sleep(0)
+    assert (await manager.task(TaskAsk(id="t-1"))).state is state
+    await until(lambda: manager.unfinished == 0 and len(plane.session.puts) > told)
+    published = [msgspec.json.decode(value, type=TaskRecord) for _, value in plane.session.puts[told:]]
+    assert [each.state for each in published] == [state]
+    assert plane.dht.records["task/t-1"].version == {**stored.version, "gw-2": 5}, "and nothing was written over it"
+
+
+async def test_a_task_that_goes_on_under_its_coordinator_is_driven_from_there(manager: TaskManager, plane: Any) -> None:
+    """An approval of the other side stands: the coordinator goes on from it instead of waiting for another."""
+    stored = await waiting(manager, plane)
+    before = manager._drivers["t-1"]
+    record = read_record(stored.value)
+    assert record.proposal is not None
+    approved = Transition(
+        task="t-1", sequence=record.sequence + 1, kind=TransitionKind.APPROVED, at_ns=2, coordinator="gw-2",
+        decision=Decision(approved=True, by="ann", act="a-1"),
+    )  # fmt: skip
+    plane.dht.change(
+        Record(key=stored.key, value=encode(machine.apply(record, approved)), version={**stored.version, "gw-2": 1})
+    )
+    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"] is not before)
+    await until(lambda: manager._drivers["t-1"].told.coordinator == "gw-1")
+    assert manager._drivers["t-1"].told.state is TaskState.RUNNING
+    assert plane.dht.records["task/t-1"].version["gw-2"] == 1, "the approval's write is in what was written since"
+
+
+async def test_a_driver_of_a_key_that_is_anothers_answers_for_nobody(manager: TaskManager, plane: Any) -> None:
+    """The ring has given the key away: the record is read where it belongs, though the driver still stands here."""
+    stored = await waiting(manager, plane)
+    plane.dht.mine = False
+    other = replace(read_record(stored.value), state=TaskState.CANCELLED, coordinator="gw-2")
+    plane.dht.records[stored.key] = Record(key=stored.key, value=encode(other), version={"gw-2": 9})
+    assert (await manager.task(TaskAsk(id="t-1"))).state is TaskState.CANCELLED
+
+
+async def test_an_id_whose_record_was_trimmed_is_not_done_again(manager: TaskManager, plane: Any) -> None:
+    """It is answered with the outcome, on whatever way it comes; nothing is driven, and it is in no list."""
+    record = replace(plane.accepted(plan=plane.plan_of()), state=TaskState.SUCCEEDED, sequence=5)
+    small = trimmed(record, "recorder-1.mcap")
+    plane.dht.records["task/t-1"] = Record(key="task/t-1", value=encode(small), version={"gw-2": 1})
+    for door in (manager.submit, manager.accept):
+        assert await door(wish(plane)) == small
+    assert "details are in the log recorder-1.mcap" in (await manager.why(WhyAsk(id="t-1"))).done
+    assert (await manager.tasks(TasksAsk(limit=10, local=True))).tasks == ()
+    await until(lambda: not manager._sweep.is_set())
+    assert manager.unfinished == 0
+    assert plane.dht.records["task/t-1"].version == {"gw-2": 1}
