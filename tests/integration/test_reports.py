@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 import zenoh
-from robots_process import BEAT, STATION, Process, beats, gateway_process, open_zenoh, read_frames
+from robots_process import BEAT, STATION, Process, gateway_process, open_zenoh, read_frames
 
 from appliance.client import FleetClient
 from appliance.errors import SwiftbotError
@@ -149,8 +149,9 @@ async def test_components_of_one_end_do_not_hear_each_other_by_the_gateway(it: P
 
 
 async def test_a_vehicle_with_two_links_is_one_and_heard_once(it: Process) -> None:
-    """The same frames by both, the other one first each time: the station gets each once, and the vehicle stays online
-    (mavlink-router/mavlink-router#240).
+    """The same frames by both, the other one first each time: the station gets each once, and the vehicle stays online.
+
+    Reported as mavlink-router/mavlink-router#240.
     """
     async with fielded(it) as field:
         radio, wifi = (await field.link())(13), (await field.link())(13)
@@ -171,8 +172,9 @@ async def test_a_vehicle_with_two_links_is_one_and_heard_once(it: Process) -> No
 
 
 async def test_a_vehicle_that_lost_one_link_is_served_by_the_other(it: Process) -> None:
-    """Silent on the first, it comes back over the second, and what is for it goes there
-    (mavlink-router/mavlink-router#110).
+    """Silent on the first, it comes back over the second, and what is for it goes there.
+
+    Reported as mavlink-router/mavlink-router#110.
     """
     async with fielded(it) as field:
         first, second = (await field.link())(14), (await field.link("tcp"))(14)
@@ -244,8 +246,9 @@ async def test_what_is_for_an_unknown_system_waits_for_nobody(it: Process) -> No
 
 
 async def test_a_station_with_an_autopilots_component_is_served(it: Process) -> None:
-    """APM Planner is 252/1: both ways for longer than anything is believed, and no robot
-    (mavlink-router/mavlink-router#382).
+    """APM Planner is 252/1: both ways for longer than anything is believed, and no robot.
+
+    Reported as mavlink-router/mavlink-router#382.
     """
     async with fielded(it) as field:
         vehicle, ground = (await field.link())(19), (await field.link())(252, 1)
@@ -274,8 +277,9 @@ async def test_a_listener_that_said_one_thing_hears_the_vehicle(it: Process) -> 
 
 
 async def test_links_come_and_go_while_others_are_served(it: Process) -> None:
-    """One that is added is routed to at once; one that is removed takes nothing of the others with it
-    (mavlink-router/mavlink-router#413).
+    """One that is added is routed to at once; one that is removed takes nothing of the others with it.
+
+    Reported as mavlink-router/mavlink-router#413.
     """
     async with fielded(it) as field:
         vehicle = (await field.link())(21)
@@ -293,8 +297,9 @@ async def test_links_come_and_go_while_others_are_served(it: Process) -> None:
 
 
 async def test_a_vehicle_is_not_mixed_up_with_another_of_its_number(it: Process) -> None:
-    """On another link: it is refused and counted, and neither the list nor the map jumps between the two
-    (mavlink/qgroundcontrol#14808).
+    """On another link: it is refused and counted, and neither the list nor the map jumps between the two.
+
+    Reported as mavlink/qgroundcontrol#14808.
     """
     async with fielded(it) as field:
         await _second_of_a_number(it, field, 22, await field.link(), await field.link("tcp"))
@@ -366,8 +371,9 @@ async def test_a_radios_heartbeats_make_no_vehicle(it: Process) -> None:
 
 
 async def test_a_companions_heartbeat_changes_no_mode(it: Process) -> None:
-    """A component of the vehicle's system with another mode, by the same way and by its own
-    (ArduPilot/pymavlink#87).
+    """A component of the vehicle's system with another mode, by the same way and by its own.
+
+    Reported as ArduPilot/pymavlink#87.
     """
     async with fielded(it) as field:
         link = await field.link()
@@ -400,7 +406,7 @@ async def test_a_gimbal_at_an_address_of_its_own_is_reached(it: Process) -> None
             gimbal.beat(type=GIMBAL, autopilot=NO_AUTOPILOT)
             ground.say("PARAM_REQUEST_READ", **read_request(28, 154))
 
-        await field.online("drone_28", act)
+        await field.online("drone_28", vehicle.beat)
         await it.until(lambda: gimbal.of("PARAM_REQUEST_READ"), act)
         assert not vehicle.of("PARAM_REQUEST_READ")
         gimbal.say("PARAM_VALUE", **VALUE)
@@ -417,7 +423,7 @@ async def test_a_station_with_a_vehicles_number_is_served(it: Process) -> None:
             vehicle.beat()
             ground.beat(**STATION)
 
-        await field.online("drone_29", act)
+        await field.online("drone_29", vehicle.beat)
         await it.until(lambda: ground.of("HEARTBEAT", 29) and vehicle.of("HEARTBEAT", 29), act)
         assert it.robots()["drone_29"].online
 
@@ -451,8 +457,9 @@ async def test_the_gateways_own_heartbeat_is_no_autopilots(it: Process) -> None:
 
 
 async def test_a_stream_that_begins_within_a_frame_is_understood(it: Process) -> None:
-    """Connected in mid-frame, with a marker among what is left of it: no restart is needed
-    (mavlink-router/mavlink-router#463).
+    """Connected in mid-frame, with a marker among what is left of it: no restart is needed.
+
+    Reported as mavlink-router/mavlink-router#463.
     """
     async with fielded(it) as field:
         vehicle = (await field.link("tcp"))(30)
@@ -480,9 +487,7 @@ async def _crafted(it: Process, field: Field, system: int, payloads: Callable[[r
             await asyncio.sleep(0.02)
             assert it.robots()[f"drone_{system}"].online
     ground = (await field.link("tcp"))(254, 190)
-    await it.until(
-        lambda: ground.of("HEARTBEAT", system), lambda: (vehicle.beat(), ground.beat(**STATION))
-    )
+    await it.until(lambda: ground.of("HEARTBEAT", system), lambda: (vehicle.beat(), ground.beat(**STATION)))
     await it.client.gateway()
 
 
@@ -616,8 +621,9 @@ async def test_a_robot_that_does_not_answer_fails_its_command(it: Process) -> No
 
 
 async def test_a_put_to_all_robots_is_of_none(it: Process) -> None:
-    """A key with a wildcard reaches whoever listens to one of its robots: nothing is shown by it, nothing removed
-    (eclipse-zenoh/zenoh#671).
+    """A key with a wildcard reaches whoever listens to one of its robots: nothing is shown by it, nothing removed.
+
+    Reported as eclipse-zenoh/zenoh#671.
     """
     async with cart(it, "cart_3") as robot:
         await it.until(lambda: shown(it, "cart_3"), lambda: robot.tell(note="mine"))
@@ -632,8 +638,9 @@ async def test_a_put_to_all_robots_is_of_none(it: Process) -> None:
 
 
 async def test_a_state_of_megabytes_is_not_shown(it: Process) -> None:
-    """Two texts of half a megabyte are left out, a state of 20 MB is dropped; both are counted, and the robot is shown
-    (eclipse-zenoh/zenoh#1835).
+    """Two texts of half a megabyte are left out, a state of 20 MB is dropped; both are counted, and the robot is shown.
+
+    Reported as eclipse-zenoh/zenoh#1835.
     """
     async with cart(it, "cart_4") as robot:
         await it.until(lambda: shown(it, "cart_4"), robot.tell)
@@ -657,7 +664,7 @@ async def test_a_request_that_comes_again_is_one_task(it: Process) -> None:
         for _ in range(4):
             robot.put("cart_5/task", payload)
         async with asyncio.timeout(30):
-            while "cart-5-1" not in await _tasks(it):  # noqa: ASYNC110 - looked at over the plane
+            while "cart-5-1" not in await _tasks(it):
                 await asyncio.sleep(0.1)
         for _ in range(4):
             robot.put("cart_5/task", payload)
@@ -673,7 +680,7 @@ async def test_whoever_comes_later_sees_the_robots(it: Process) -> None:
             async with FleetClient(it.fleet.endpoint) as client:
                 await client.gateway()
                 async with asyncio.timeout(30):
-                    while "cart_6" not in client.plane.registry.robots:  # noqa: ASYNC110 - looked at over the plane
+                    while "cart_6" not in client.plane.registry.robots:
                         await asyncio.sleep(0.1)
                 assert client.plane.registry.robots["cart_6"].online
 

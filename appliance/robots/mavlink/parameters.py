@@ -100,9 +100,7 @@ async def write(vehicle: Vehicle, name: str, value: float, *, patience: Patience
     return holds
 
 
-async def _exchange(
-    vehicle: Vehicle, name: str, request: Message, patience: Patience
-) -> tuple[float, int] | None:
+async def _exchange(vehicle: Vehicle, name: str, request: Message, patience: Patience) -> tuple[float, int] | None:
     async with vehicle.exchange, vehicle.listening("PARAM_VALUE") as answers:
         for _ in range(patience.tries):
             vehicle.send(request)

@@ -27,8 +27,9 @@ async def test_a_container_whose_run_was_too_long_is_not_used_again(bench: Any, 
 
 
 async def test_what_an_earlier_life_left_is_taken_or_removed(bench: Any) -> None:
-    """Containers of before a restart serve or go, those that have ended too, and others' are left alone
-    (apache/openwhisk#2858).
+    """Containers of before a restart serve or go, those that have ended too, and others' are left alone.
+
+    Reported as apache/openwhisk#2858.
     """
     before = await bench.pool(floor={"base": 2})
     await bench.ready(before, 2)
@@ -141,7 +142,7 @@ async def test_whoever_waits_is_told_why_a_worker_died(bench: Any, tmp_path: Pat
 
 
 async def test_a_pool_does_not_begin_a_run_a_second_time(bench: Any, tmp_path: Path) -> None:
-    """Neither beside the first nor by itself after a crash: what it did may not be done twice (ray-project/ray#2635)."""
+    """Neither beside the first nor by itself after a crash, which it may have survived (ray-project/ray#2635)."""
     pool = await bench.pool(capacity=2)
     task = asyncio.create_task(bench.run(pool, bench.request(1, do="sleep", pid=str(tmp_path / "pid"))))
     await bench.until((tmp_path / "pid").exists, "the run")

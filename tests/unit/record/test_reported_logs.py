@@ -44,8 +44,9 @@ def made(**options: Any) -> bytes:
 
 
 def test_a_file_cut_in_mid_chunk_gives_its_whole_chunks_to_a_new_one(tmp_path: Path) -> None:
-    """Power is lost between two writes of a chunk: the rest is found, told and made a file with an index
-    (foxglove/mcap#385).
+    """Power is lost between two writes of a chunk: the rest is found, told and made a file with an index.
+
+    Reported as foxglove/mcap#385.
     """
     cut = log(tmp_path, PACKED[: len(PACKED) // 3])
     expected = list(read(cut))
@@ -58,8 +59,9 @@ def test_a_file_cut_in_mid_chunk_gives_its_whole_chunks_to_a_new_one(tmp_path: P
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9, 0.97, 0.99])
 def test_a_recovered_file_is_read_by_everybody(tmp_path: Path, share: float) -> None:
-    """Cut in the summary too: the library's indexed reader opens what came out, statistics and all
-    (foxglove/mcap#1474).
+    """Cut in the summary too: the library's indexed reader opens what came out, statistics and all.
+
+    Reported as foxglove/mcap#1474.
     """
     cut = log(tmp_path, PACKED[: int(len(PACKED) * share)])
     told = recover(cut, tmp_path / "out.mcap")
@@ -208,8 +210,9 @@ while True:
 
 
 def test_power_that_goes_costs_the_last_moments_only(tmp_path: Path, project_root: Path) -> None:
-    """The recording process is killed in mid-write: the log can be read up to half a second before
-    (ros2/rosbag2#2133).
+    """The recording process is killed in mid-write: the log can be read up to half a second before.
+
+    Reported as ros2/rosbag2#2133.
     """
     process = subprocess.Popen(
         [sys.executable, "-c", _KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=project_root
@@ -230,8 +233,9 @@ def test_power_that_goes_costs_the_last_moments_only(tmp_path: Path, project_roo
 
 
 def test_a_file_needs_nothing_beside_it(tmp_path: Path) -> None:
-    """No metadata file that may be missing: what it is of is in each log, also in one that was cut
-    (ros2/rosbag2#395).
+    """No metadata file that may be missing: what it is of is in each log, also in one that was cut.
+
+    Reported as ros2/rosbag2#395.
     """
     writer = writer_of(tmp_path / "logs")
     writer.write(_message(1))
@@ -246,8 +250,9 @@ def test_a_file_needs_nothing_beside_it(tmp_path: Path) -> None:
 
 
 def test_times_that_are_none_do_not_get_into_a_log(tmp_path: Path) -> None:
-    """A time that has rolled over is replaced by that of arrival, and the file stays in one piece
-    (ros2/rosbag2#2389).
+    """A time that has rolled over is replaced by that of arrival, and the file stays in one piece.
+
+    Reported as ros2/rosbag2#2389.
     """
     writer = writer_of(tmp_path)
     writer._wall = lambda: 77

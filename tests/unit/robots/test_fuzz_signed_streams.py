@@ -1,4 +1,4 @@
-"""Streams of signed and unsigned frames of both versions, cut anywhere, with damage: by pymavlink and by the gateway."""
+"""Streams of signed and unsigned frames of both versions, cut anywhere, with damage, as pymavlink reads them too."""
 
 import itertools
 from collections import Counter
@@ -48,7 +48,7 @@ def undamaged(draw: st.DrawFn) -> list[bytes]:
 
 @st.composite
 def streams(draw: st.DrawFn) -> bytes:
-    """Draw a stream: some of its frames with a changed, a lost or an inserted byte, cut, doubled, or with noise ahead."""
+    """Draw a stream: some of its frames with a byte changed, lost or inserted, cut, doubled, or behind noise."""
     whole = bytearray()
     for raw in draw(undamaged()):
         piece = bytearray(raw)

@@ -48,8 +48,9 @@ async def settle() -> None:
 
 
 async def test_a_count_that_comes_again_begins_no_deadlock(store: FakeStore) -> None:
-    """The station did not hear the request and says the count again, before and after the first item
-    (PX4/PX4-Autopilot#3051).
+    """The station did not hear the request and says the count again, before and after the first item.
+
+    Reported as PX4/PX4-Autopilot#3051.
     """
     ground = Ground(store)
     ground.tell("MISSION_COUNT", count=2)
@@ -65,7 +66,7 @@ async def test_a_count_that_comes_again_begins_no_deadlock(store: FakeStore) -> 
 
 
 async def test_no_item_before_the_first_is_asked_for(store: FakeStore) -> None:
-    """When the count was lost nothing is asked; an item out of the blue is answered as what it is (mavlink/MAVSDK#678)."""
+    """Where the count was lost nothing is asked, and an item alone is refused (mavlink/MAVSDK#678)."""
     ground = Ground(store)
     ground.give(1, MISSION)
     for _ in range(100):
@@ -149,8 +150,9 @@ async def test_a_heading_that_is_not_set_is_no_error(store: FakeStore) -> None:
 
 
 def test_an_altitude_that_is_not_set() -> None:
-    """NaN as param7 is the ground where a landing names a place; a take-off without a height is refused by its number
-    (mavlink/qgroundcontrol#5183).
+    """NaN as param7 is the ground where a landing names a place; a take-off without a height is refused by its number.
+
+    Reported as mavlink/qgroundcontrol#5183.
     """
     landing = replace(item(LAND, 12, 4), z=None)
     assert [each.skill for each in plan_of([MISSION[0], landing], robot="drone_1", site=SITE).subtasks][-1] == "land"
@@ -189,8 +191,9 @@ async def test_a_long_mission_comes_whole_over_a_slow_link(store: FakeStore) -> 
 
 
 async def test_answers_that_come_after_the_next_question(store: FakeStore) -> None:
-    """Each item takes longer than the wait for it, so that each is asked for and given twice
-    (PX4/PX4-Autopilot#11078).
+    """Each item takes longer than the wait for it, so that each is asked for and given twice.
+
+    Reported as PX4/PX4-Autopilot#11078.
     """
     ground = Ground(store)
     ground.tell("MISSION_COUNT", count=len(MISSION))
@@ -246,8 +249,9 @@ async def test_two_in_a_row_are_told_apart(fleet: Fleet) -> None:
 
 
 async def test_an_answer_is_of_one_command(fleet: Fleet) -> None:
-    """Another one while the first has no answer is turned away: nobody mistakes whose the answer is
-    (mavlink/qgroundcontrol#2975).
+    """Another one while the first has no answer is turned away: nobody mistakes whose the answer is.
+
+    Reported as mavlink/qgroundcontrol#2975.
     """
     fleet.gate.clear()
     fleet.send(param1=1.0)
@@ -375,8 +379,9 @@ async def test_what_a_whole_number_cannot_be_is_not_sent(value: float) -> None:
 
 
 async def test_ardupilots_whole_numbers_are_cast() -> None:
-    """The other encoding, told by the autopilot: what is true of one is not done to the other
-    (ArduPilot/pymavlink#743).
+    """The other encoding, told by the autopilot: what is true of one is not done to the other.
+
+    Reported as ArduPilot/pymavlink#743.
     """
     told = {"param_value": 5.0, "param_type": 6, "param_count": 2, "param_index": 0}
     fake = Fake(lambda _: [make("PARAM_VALUE", param_id=b"SYSTEM", **told)])

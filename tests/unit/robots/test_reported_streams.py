@@ -232,8 +232,9 @@ def test_a_slow_end_gets_the_messages_that_its_link_lets_out() -> None:
 
 
 def test_what_is_sent_again_later_is_no_copy() -> None:
-    """Copies stop only what comes within half a second: lost log data sent anew goes through
-    (mavlink-router/mavlink-router#323).
+    """Copies stop only what comes within half a second: lost log data sent anew goes through.
+
+    Reported as mavlink-router/mavlink-router#323.
     """
     router = Router(own_system=242, repeat_s=0.5)
     data = beat()

@@ -16,23 +16,25 @@ from appliance.tasks.healing import foreign, heal
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind, apply, gives_up
 from appliance.tasks.migration.api import DrainAsk
 from appliance.tasks.surroundings import CancelAsked, GatewayLost
+from tests.unit.tasks import test_executor
+from tests.unit.tasks.migration import test_draining, test_moving
 from tests.unit.tasks.migration.test_draining import Gateway, here
-from tests.unit.tasks.migration.test_draining import quick as quick
 from tests.unit.tasks.migration.test_moving import ASK, Fleet, start_there
-from tests.unit.tasks.migration.test_moving import fleet as fleet
 from tests.unit.tasks.test_driver import answer
 from tests.unit.tasks.test_executor import REQUEST, finish, until
-from tests.unit.tasks.test_executor import executor as executor
 from tests.unit.tasks.test_healing import lost, record_of, split
 from tests.unit.tasks.test_machine import dispatched, planned, step
 
 pytestmark = pytest.mark.anyio
+executor, fleet, quick = test_executor.executor, test_moving.fleet, test_draining.quick
+"""Fixtures of those modules."""
 SUCCEEDED, FAILED, STARTED = RunEventKind.SUCCEEDED, RunEventKind.FAILED, RunEventKind.STARTED
 
 
 async def test_a_gateway_that_comes_back_ends_what_was_repeated_meanwhile(plane: Any) -> None:
-    """Of a run that went on there and its repetition one is kept, and the other is ended once
-    (hashicorp/nomad#12680).
+    """Of a run that went on there and its repetition one is kept, and the other is ended once.
+
+    Reported as hashicorp/nomad#12680.
     """
     record = record_of(plane, split(lost(1, "gw-1")), attempt=2)
     healing = heal(record)
@@ -102,7 +104,7 @@ async def test_a_run_that_moves_is_ended_before_the_new_one_begins(fleet: Fleet)
     assert [verb for verb, _ in fleet.asked if verb != "run_status"] == ["run_reserve", "run_hold", "run_leave"]
 
 
-async def test_a_drain_moves_what_finds_no_room_at_first(quick: None) -> None:
+async def test_a_drain_moves_what_finds_no_room_at_first() -> None:
     """It is asked for again until it is taken, and the drain does not end without it (hashicorp/nomad#7887)."""
     gateway = Gateway(here("s1"), here("s2"))
     gateway.problems["s1"] = [RefusedError("no gateway takes s1: exhausted") for _ in range(5)]
@@ -113,7 +115,7 @@ async def test_a_drain_moves_what_finds_no_room_at_first(quick: None) -> None:
     assert gateway.cancelled == []
 
 
-async def test_a_drain_tells_what_it_waits_for(quick: None) -> None:
+async def test_a_drain_tells_what_it_waits_for() -> None:
     """A run that cannot move does not leave it stuck without a word (hashicorp/nomad#12835)."""
     gateway = Gateway(here("s1"))
     gateway.problems["s1"] = [RefusedError("no gateway takes s1: its volume is here") for _ in range(50)]
@@ -146,7 +148,8 @@ def test_an_end_and_a_cancel_at_once_leave_one_end(order: list[str]) -> None:
         "cancel": (TransitionKind.CANCEL, {}),
         "succeeded": (TransitionKind.SUCCEEDED, {"subtask": "s1", "attempt": 1, "result": {}}),
         "failed": (
-            TransitionKind.ATTEMPT_FAILED, {"subtask": "s1", "attempt": 1, "failure": failure, "give_up": True},
+            TransitionKind.ATTEMPT_FAILED,
+            {"subtask": "s1", "attempt": 1, "failure": failure, "give_up": True},
         ),
     }
     ends = 0
