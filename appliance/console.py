@@ -22,6 +22,7 @@ from appliance.model import (
     ContainerInfo,
     GatewayStatus,
     Plan,
+    RecorderNote,
     RobotInfo,
     SubtaskRecord,
     SubtaskState,
@@ -34,10 +35,12 @@ from appliance.pool.images import ImageState
 from appliance.pool.transfer.api import Brought
 from appliance.reasons import milliseconds
 from appliance.record.facts import LogInfo
+from appliance.record.heard import kinds_text, problem_of, together
 from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.check import CheckReport
 from appliance.tasks.replay import ReplayReport
+from appliance.tasks.why import waits_for
 
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""
@@ -167,7 +170,9 @@ def plan_answer(answer: PlanAnswer) -> Group:
 
 
 def brief(record: SubtaskRecord) -> str:
-    """A result or failure in a few words."""
+    """A result or failure in a few words; of a subtask that has not ended what it does or waits for goes first."""
+    if record.note and not record.state.final and record.failure is not None:
+        return record.note if record.failure.message in record.note else f"{record.note} ({record.failure.message})"
     if record.failure is not None and record.state is not SubtaskState.SUCCEEDED:
         return record.failure.message
     if record.note and not record.state.final:
@@ -265,7 +270,8 @@ def progress_line(record: SubtaskRecord) -> str:
 def task_list(records: Sequence[TaskRecord]) -> Table:
     """Tasks, a line each."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
-    for name in ("task", "state", "done", "coordinator", "instruction"):
+    waits = {record.id: text for record in records if (text := waits_for(record))}
+    for name in ("task", "state", "done", "coordinator", "instruction", *(["waits for"] if waits else [])):
         table.add_column(name, overflow="fold")
     for record in records:
         done = sum(each.state is SubtaskState.SUCCEEDED for each in record.subtasks)
@@ -275,8 +281,23 @@ def task_list(records: Sequence[TaskRecord]) -> Table:
             f"{done}/{len(record.subtasks)}",
             record.coordinator,
             record.instruction,
+            *([Text(waits.get(record.id, ""), style="yellow")] if waits else []),
         )
     return table
+
+
+def fleet_view(gateways: Sequence[GatewayStatus]) -> Group:
+    """Gateways, a line each, and below them what is wrong with the recorders."""
+    notes = together(note for each in gateways for note in each.recorders)
+    lines = [Text(f"! {text}", style="yellow") for note in notes if (text := recorder_text(note))]
+    return Group(gateway_table(gateways), *lines)
+
+
+def recorder_text(note: RecorderNote) -> str:
+    """What is wrong with a recorder, with a hint; empty when nothing is."""
+    problem = problem_of(note)
+    name = f"recorder {note.id}".removesuffix(" recorder")
+    return f"{name}: {problem} (hint: `swiftbot log info FILE` says when)" if problem else ""
 
 
 def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
@@ -439,6 +460,11 @@ def log_summary(found: LogInfo) -> Group:
         notes.append(
             Text(f"! {found.not_heard:,} messages never reached the recorder, by their numbers", style="yellow")
         )
+    if found.missed:
+        notes.append(Text(f"! missing by key: {kinds_text(found.missed, most=8)}", style="yellow"))
+    if found.not_received:
+        text = f"{found.not_received:,} frames of vehicles were received by no gateway (link, or the gateway was down)"
+        notes.append(Text(f"· {text}", style="dim"))
     for each in found.incidents:
         at = datetime.fromtimestamp(each.at_ns / 1e9, tz=UTC).isoformat(timespec="milliseconds")
         notes.append(Text(f"incident {at} {each.reason} {each.detail} {each.key}".rstrip(), style="bold red"))

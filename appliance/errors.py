@@ -145,9 +145,13 @@ class PlanError(SwiftbotError):
     code = "plan"
     exit_code = Exit.REFUSED
 
-    def __init__(self, message: str, *, remedy: str = "", problems: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, message: str, *, remedy: str = "", problems: tuple[str, ...] = (), oversize: bool = False
+    ) -> None:
         super().__init__(message, remedy=remedy)
         self.problems = problems
+        self.oversize = oversize
+        """Whether the plan would be longer than any may be: no other planner can do better."""
 
 
 class PoolError(SwiftbotError):
@@ -166,6 +170,16 @@ class ContractError(RobotError):
     """A robot's program does not keep to docs/robot-contract.md: another attempt would go the same way."""
 
     code = "contract"
+
+
+class PreconditionError(RobotError):
+    """What is asked cannot be done as things stand: too far away, the hand full or empty, still on the ground.
+
+    The order is at fault and not the robot; a step before it would help.
+    """
+
+    code = "precondition"
+    exit_code = Exit.REFUSED
 
 
 class TakenError(RobotError):

@@ -43,6 +43,8 @@ from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
+from appliance.record.facts import RecorderStatus
+from appliance.record.heard import Recorders
 from appliance.robot_tasks import RobotTasks
 from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.authority.authority import SHOWN, Authority
@@ -87,6 +89,7 @@ class Gateway:
         self._kept = Kept(config.id)
         """The last lines about tasks that this gateway has said."""
         self._site_problem = ""
+        self._recorders = Recorders()
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -108,6 +111,11 @@ class Gateway:
         await self.plane.until_back()
 
         await self._start_planner(catalogue)
+
+        recorders = self.plane.session.subscribe_typed(
+            self.plane.keys.recorder_status(), RecorderStatus, self._hear_recorder
+        )
+        self._stack.callback(recorders.close)
 
         audit = Audit(self.plane.session, self.plane.keys, config.id)
         self._stack.callback(audit.listen().close)
@@ -348,6 +356,10 @@ class Gateway:
         self._kept.hear_log(line)
         self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
 
+    def _hear_recorder(self, _key: str, status: RecorderStatus | None) -> None:
+        if status is not None and self._recorders.hear(status, time.monotonic()):
+            self._changed.set()
+
     def _serve_operators(self, audit: Audit) -> None:
         """Answer what operators order of this gateway's pool and model."""
         rpc, verbs = self.plane.rpc, self.pool.verbs
@@ -402,6 +414,7 @@ class Gateway:
             volumes=self._storage.volumes(),
             models=self.decomposer.models,
             planner=self.decomposer.status,
+            recorders=self._recorders.notes(time.monotonic()),
             robots=self.hub.attached,
             stops=self.authority.active[:SHOWN],
             leases=self.authority.leases[:SHOWN],

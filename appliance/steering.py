@@ -14,7 +14,18 @@ import msgspec
 from appliance.connection import FleetConnection
 from appliance.errors import DeadlineError, PayloadError, RobotError, SwiftbotError, UnreachableError, from_code
 from appliance.llm.api import SwapAsk, Swapped
-from appliance.model import Act, Enquiry, Lease, Plan, RobotReply, SoftStop, TaskRecord, encode
+from appliance.model import (
+    Act,
+    Enquiry,
+    Lease,
+    Plan,
+    RobotReply,
+    SoftStop,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+    encode,
+)
 from appliance.robots.authority.api import (
     LEASE_S,
     DriveAsk,
@@ -48,6 +59,18 @@ STOP_S = 6.0
 """How long a stop waits to be confirmed: by then it has long been put."""
 SWAP_S = 300.0
 """Loading a large model from a slow disk, and its self-test."""
+
+
+def cancel_outcome(record: TaskRecord) -> str:
+    """Return what came of a cancel, in words, by the record that answered it."""
+    active = sum(each.state in (SubtaskState.DISPATCHED, SubtaskState.RUNNING) for each in record.subtasks)
+    if record.state is TaskState.CANCELLED:
+        return f"task {record.id} is cancelled"
+    if record.state is TaskState.CANCELLING:
+        return f"task {record.id} is being cancelled: {active} of its runs are being ended"
+    if record.state.final:
+        return f"task {record.id} {record.state} before the cancel came"
+    return f"the cancel of task {record.id} is noted; its coordinator {record.coordinator} has not confirmed it yet"
 
 
 class Signature(TypedDict):
@@ -104,7 +127,7 @@ class SteeringCalls(FleetConnection):
         return await self._ask("retry", RetryAsk(id=task, subtask=subtask, **self._sign(why)), TaskRecord)
 
     async def cancel(self, task: str, *, why: str = "") -> TaskRecord:
-        """Stop a task."""
+        """Stop a task; returns what came of it, which `cancel_outcome` says in words."""
         return await self._ask("cancel", CancelTaskAsk(id=task, **self._sign(why)), TaskRecord)
 
     async def enquiries(self) -> EnquiryList:

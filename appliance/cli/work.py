@@ -18,6 +18,7 @@ from appliance.console_watch import stream_line
 from appliance.errors import ConfigError, Exit, UnapprovedError
 from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
+from appliance.steering import cancel_outcome
 from appliance.tasks.view import view
 
 task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agree to new plans.", group=WORK)
@@ -227,13 +228,12 @@ def task_cancel(
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
-    """Stop a task; returns when it has ended."""
+    """Stop a task; returns when it has ended, and says so when it had ended before."""
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             record = await client.cancel(task, why=why)
-            if not record.state.final:
-                console.err.print(f"task {task} is being cancelled")
+            console.err.print(cancel_outcome(record))
             async for record in client.watch(task):  # noqa: B007 - the last one is shown
                 pass
         show(view(record), as_json=as_json, table=console.task_table(record))
@@ -243,13 +243,13 @@ def task_cancel(
 
 
 def fleet(*, as_json: Json = False, where: Where = HERE) -> int:
-    """Show the gateways."""
+    """Show the gateways, and what is wrong with the recorders."""
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
             await client.gateway()
             found = sorted(client.plane.registry.gateways.values(), key=lambda each: each.id)
-        show(found, as_json=as_json, table=console.gateway_table(found))
+        show(found, as_json=as_json, table=console.fleet_view(found))
 
     asyncio.run(go())
     return 0

@@ -393,6 +393,10 @@ class Decomposer:
                     proposal = await slot.planner.propose(context, previous=proposal.plan, problems=found.problems)
                     confidence, plan, found = judged(proposal)
         except PlanError as error:
+            if error.oversize:
+                refusals.append(
+                    Finding(check="size", severity=Severity.REFUSE, message=error.message, hint=error.remedy)
+                )
             return None, attempt(ok=False, confidence=0.0, problems=(error.message, *error.problems)), True
         except SwiftbotError as error:
             log.warning("planner tier gave no plan", tier=tier, why=str(error))

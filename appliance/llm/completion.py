@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from appliance.llm.checks.accounting import text_said
 from appliance.llm.checks.finding import Facts
+from appliance.llm.checks.places import locate
 from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.robots import candidates
 from appliance.llm.checks.schema import is_unnamed
@@ -66,11 +67,25 @@ def _sent(facts: Facts) -> Plan:
     return replace(facts.plan, subtasks=subtasks) if subtasks != facts.plan.subtasks else facts.plan
 
 
+_TO = re.compile(r"^(?:(?:over|on|back|up|down) )?(?:to|towards|at) (?:the )?", re.IGNORECASE)
+
+
+def _spot(path: str, facts: Facts) -> str:
+    """The one place or coordinate that a path is, without brackets; empty where it is more."""
+    place = _TO.sub("", path.strip())
+    place = place.strip("() ") if place.startswith("(") and place.endswith(")") else place
+    known = facts.site is not None and locate(place, facts.site) is not None
+    return place if known else ""
+
+
 def _way_only(facts: Facts, subtask: Subtask) -> Subtask:
     manifest, values = facts.manifest(subtask), list(subtask.params.values())
     if manifest is None or facts.site is None or subtask.skill == WAY or WAY not in facts.catalogue.skills:
         return subtask
     stays = manifest.moves_robot and set(manifest.uses) == {"base"} and not facts.account.called[subtask.id]
+    path = subtask.params.get("path")
+    if isinstance(path, str) and len(values) == 1 and (spot := _spot(path, facts)):
+        return replace(subtask, skill=WAY, params={"place": spot})  # one place is no path
     usual = [str(each.usual) for each in manifest.params.values() if isinstance(each.usual, str)]
     place = values[0] if len(values) == 1 and isinstance(values[0], str) else ""
     if not values and usual and text_said(facts.reading, usual[0], facts.site):

@@ -20,7 +20,7 @@ from appliance.llm.checks.policy import policy_holds, unsafe
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import PlanContext
-from appliance.model import Finding, Plan, Severity, Verdict
+from appliance.model import SPLIT, Finding, Plan, Severity, Verdict
 from appliance.skills.catalogue import Catalogue
 
 __all__ = ["CHECKS", "Check", "Facts", "Review", "review"]
@@ -117,7 +117,8 @@ def reasons(context: PlanContext, catalogue: Catalogue) -> tuple[Finding, ...]:
 def _refusing(name: str, problems: Callable[[Facts], Iterable[str]]) -> Callable[[Facts], Iterable[Finding]]:
     def run(facts: Facts) -> Iterable[Finding]:
         for text in problems(facts):
-            yield Finding(check=name, severity=Severity.REFUSE, message=text)
+            hint = SPLIT if text.endswith(SPLIT) else ""
+            yield Finding(check=name, severity=Severity.REFUSE, message=text.removesuffix(f": {SPLIT}"), hint=hint)
 
     return run
 

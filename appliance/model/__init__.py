@@ -11,6 +11,7 @@ from appliance.model.gateways import (
     ContainerState,
     GatewayStatus,
     PoolHint,
+    RecorderNote,
     VolumeInfo,
 )
 from appliance.model.messages import (
@@ -36,6 +37,8 @@ from appliance.model.planner import (
     UpstreamStatus,
 )
 from appliance.model.plans import (
+    MAX_SUBTASKS,
+    SPLIT,
     Finding,
     Plan,
     Provenance,
@@ -44,6 +47,7 @@ from appliance.model.plans import (
     Tier,
     TierAttempt,
     Verdict,
+    oversize,
     plan_hash,
 )
 from appliance.model.requests import (
@@ -108,7 +112,9 @@ from appliance.model.tasks import (
 __all__ = [
     "HIGHEST_PRIORITY",
     "LONGEST_DEADLINE_S",
+    "MAX_SUBTASKS",
     "PLAIN_PRIORITY",
+    "SPLIT",
     "Act",
     "Approval",
     "Attempt",
@@ -144,6 +150,7 @@ __all__ = [
     "Pose",
     "Proposal",
     "Provenance",
+    "RecorderNote",
     "Revision",
     "RevisionKind",
     "RobotCommand",
@@ -177,5 +184,6 @@ __all__ = [
     "Way",
     "Word",
     "encode",
+    "oversize",
     "plan_hash",
 ]

@@ -62,6 +62,22 @@ class PoolHint(Struct, frozen=True, kw_only=True, omit_defaults=True):
     need: Need | None = None
 
 
+class RecorderNote(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A recorder of the fleet, as a gateway hears it."""
+
+    id: str
+    state: str = ""
+    """As in RecorderStatus, or `silent`: not heard for more than 5 s."""
+    problem: str = ""
+    """Why it does not record; empty when it does."""
+    missed: int = 0
+    """Messages of the fleet that are not in its log, since it was started."""
+    keys: dict[str, int] = field(default_factory=dict[str, int])
+    """The same by kind of key, such as `gw/*/log`; the ten largest."""
+    missed_at_ns: int = 0
+    """Time of the last one that is missing."""
+
+
 class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A gateway's own account of itself, pushed on change and every few seconds."""
 
@@ -111,6 +127,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Language models it plans with, in order of asking, as `tier:name`; `rules` stands for the parser."""
     planner: PlannerStatus | None = None
     """How its planner does; a change of it alone is told with the next status."""
+    recorders: tuple[RecorderNote, ...] = ()
+    """The fleet's recorders as this gateway hears them; told at once when one misses messages."""
     robots: tuple[str, ...] = ()
     endpoints: tuple[str, ...] = ()
     refused: dict[str, int] = field(default_factory=dict[str, int])

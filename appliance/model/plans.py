@@ -101,6 +101,15 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Why an operator should agree before it runs; empty: nothing is against it."""
     findings: tuple[Finding, ...] = ()
     """What the review of the plan found, by the name of the check."""
+    edited: bool = False
+    """Whether an operator changed the plan before it ran: all else here is of the plan before that."""
+
+
+MAX_SUBTASKS = 64
+"""Subtasks that a plan may have. A longer one is a model that loops, or work for several tasks; the record of a task
+holds a result of up to `tasks.max_result_bytes` for each."""
+SPLIT = f"split it into tasks of at most {MAX_SUBTASKS} subtasks"
+"""The remedy for a plan that is longer."""
 
 
 class Plan(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -113,6 +122,11 @@ class Plan(Struct, frozen=True, kw_only=True, omit_defaults=True):
     latency_ms: float = 0.0
     provenance: Provenance | None = None
     """None for a plan that was written by hand."""
+
+
+def oversize(count: int) -> str:
+    """Return what is wrong with a plan of so many subtasks, with the limit; "" when it has room."""
+    return f"the plan has {count} subtasks, at most {MAX_SUBTASKS} are possible" if count > MAX_SUBTASKS else ""
 
 
 def plan_hash(plan: Plan) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from appliance.model.open_enum import OpenEnum
+from appliance.model.plans import Plan
 
 MAX_BY = 120
 MAX_WHY = 500
@@ -82,6 +83,10 @@ class Decision(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Of the plan that the operator had before them."""
     edited: bool = False
     """Whether another plan was approved in its place."""
+    plan: Plan | None = None
+    """The plan that was turned down, or in whose place another was approved, with where it came from."""
+    note: str = ""
+    """Why that plan waited for an operator."""
     act: str = ""
     at_ns: int = 0
 

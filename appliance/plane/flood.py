@@ -35,7 +35,8 @@ class Flood(Generic[T]):
         raw: the Zenoh session.
         expr: what to hear.
         make: makes a message of key, time (Unix nanoseconds of the sender's clock, or of arrival without one), payload,
-            Zenoh encoding and whether it is a deletion.
+            Zenoh encoding, whether it is a deletion, and the session and number it has there (`plane.backlog`; "" and 0
+            where the sender does not say).
         take: gets batches, in order, on the draining thread; must not block.
         limit: payload bytes beyond which a message is not taken.
         on_oversize: told key and size of such a one, on the draining thread.
@@ -46,7 +47,7 @@ class Flood(Generic[T]):
         raw: zenoh.Session,
         expr: str,
         *,
-        make: Callable[[str, int, bytes, str, bool], T],
+        make: Callable[[str, int, bytes, str, bool, str, int], T],
         take: Callable[[list[T]], None],
         limit: int,
         on_oversize: Callable[[str, int], None],
@@ -96,4 +97,6 @@ class Flood(Generic[T]):
             return
         at_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns()
         deleted = sample.kind == zenoh.SampleKind.DELETE
-        batch.append(self._make(key, at_ns, payload.to_bytes(), str(sample.encoding), deleted))
+        info = sample.source_info
+        source, number = (f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn) if info is not None else ("", 0)
+        batch.append(self._make(key, at_ns, payload.to_bytes(), str(sample.encoding), deleted, source, number))

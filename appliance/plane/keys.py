@@ -74,6 +74,10 @@ class Keys:
         """Put by the gateway that was asked: answers to the direct questions of that Zenoh session."""
         return f"{self.root}/@answers/{session}"
 
+    def backlog(self, session: str) -> str:
+        """Queryable of each session that puts: what it has put lately (`plane.backlog`), for recorders."""
+        return f"{self.root}/@backlog/{session}"
+
     def exchange(self, gateway: str = "*", verb: str = "*") -> str:
         """Put by the answering gateway: what was asked over RPC and answered (queries cannot be subscribed to)."""
         return f"{self.root}/gw/{gateway}/exchange/{verb}"

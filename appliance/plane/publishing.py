@@ -31,8 +31,11 @@ class Message(Struct, frozen=True):
 class Publishing:
     """Facts out and in of one session."""
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Wire, on_first: Callable[[], None] = lambda: None) -> None:
+        """`on_first` is called on the sender's thread before the first put."""
         self._wire = wire
+        self._on_first = on_first
+        self._recorded = f"{wire.keys.root}/"
 
     def put(self, key: str, payload: bytes, *, encoding: str = "application/json", express: bool = False) -> None:
         """Publish; returns at once. What cannot be sent (too large, queue full) is counted and logged.
@@ -43,19 +46,44 @@ class Publishing:
         if len(payload) > self._wire.config.max_payload_bytes:
             self._wire.refuse("oversize put", key=key, size=len(payload))
             return
-        send = partial(
-            self._wire.raw.put,
-            key,
-            payload,
-            encoding=encoding,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            express=express,
-        )
-        self._wire.send(key, send, len(payload))
+        self._send(key, payload, encoding=encoding, express=express)
 
     def delete(self, key: str) -> None:
         """Publish that a key's fact is gone."""
-        self._wire.send(key, partial(self._wire.raw.delete, key, congestion_control=zenoh.CongestionControl.BLOCK), 0)
+        self._send(key, None)
+
+    def _send(self, key: str, payload: bytes | None, *, encoding: str = "", express: bool = False) -> None:
+        say = partial(self._say, key, payload, encoding, express)
+        if not self._wire.send(key, say, len(payload or b"")) and self._is_recorded(key):
+            self._wire.backlog.not_sent(key)
+
+    def _is_recorded(self, key: str) -> bool:
+        """Whether recorders subscribe to a key: they cannot miss what no wildcard matches."""
+        return key.startswith(self._recorded) and "/@" not in key
+
+    def _say(self, key: str, payload: bytes | None, encoding: str, express: bool) -> None:
+        """Put, or delete where there is no payload, with number and time of its own; on the sender's thread."""
+        raw, backlog = self._wire.raw, self._wire.backlog
+        stamp, source = raw.new_timestamp(), None
+        if self._is_recorded(key):
+            if not backlog.last:
+                self._on_first()
+            at_ns = stamp.get_time_as_ntp64().as_nanos()
+            number = backlog.say(key, at_ns, payload or b"", encoding, deleted=payload is None)
+            source = zenoh.SourceInfo(self._wire.source.source_id, number)
+        block = zenoh.CongestionControl.BLOCK
+        if payload is None:
+            raw.delete(key, congestion_control=block, timestamp=stamp, source_info=source)
+        else:
+            raw.put(
+                key,
+                payload,
+                encoding=encoding,
+                congestion_control=block,
+                express=express,
+                timestamp=stamp,
+                source_info=source,
+            )
 
     def subscribe(
         self, expr: str, callback: Callable[[Message], None], *, heed: Callable[[str], bool] = lambda _: True
@@ -93,7 +121,7 @@ class Publishing:
         return closer
 
     def flood(
-        self, expr: str, make: Callable[[str, int, bytes, str, bool], T], take: Callable[[list[T]], None]
+        self, expr: str, make: Callable[[str, int, bytes, str, bool, str, int], T], take: Callable[[list[T]], None]
     ) -> Closer:
         """Have everything under `expr` delivered in batches, past the event loop, on a thread of its own (`Flood`).
 

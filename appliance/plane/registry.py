@@ -11,7 +11,7 @@ import contextlib
 import math
 import random
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import structlog
 from msgspec.structs import replace
@@ -103,6 +103,11 @@ class Registry:
                 session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
                 session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
             ]
+
+    @property
+    def lost_ns(self) -> Mapping[str, int]:
+        """When each robot that is offline was lost, Unix nanoseconds by this machine's clock."""
+        return self._roster.lost_ns
 
     def doubtful(self, robot: str) -> bool:
         """Whether more than one may carry out what this robot is ordered."""

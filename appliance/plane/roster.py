@@ -32,6 +32,8 @@ class Roster:
         self.robots: dict[str, RobotInfo] = {}
         self._session = session
         self._on_change = on_change
+        self.lost_ns: dict[str, int] = {}
+        """When each robot that is offline was lost, Unix nanoseconds by this machine's clock, also without its row."""
         self._gone: dict[str, float] = {}
         self._speakers: dict[str, tuple[str, float]] = {}
         """Who speaks for each name, and when it did last."""
@@ -55,7 +57,7 @@ class Roster:
             if robot.id not in self.robots and len(self.robots) < MOST_ROBOTS and self._named(robot.id):
                 self.robots[robot.id] = self._believed(robot)
                 if not robot.online:
-                    self._gone[robot.id] = time.monotonic()
+                    self._went(robot.id)
                 self._on_change()
 
     def _heard(self, message: Message) -> None:
@@ -115,6 +117,7 @@ class Roster:
         if info is None:
             # Somebody removed its row: a robot that is merely gone is put as offline, or its token ends.
             self._gone.pop(robot, None)
+            self.lost_ns.pop(robot, None)
             self._speakers.pop(robot, None)
             self._rivals.pop(robot, None)
             if self.robots.pop(robot, None) is not None:
@@ -137,8 +140,9 @@ class Roster:
         self.robots[robot] = info
         if info.online:
             self._gone.pop(robot, None)
+            self.lost_ns.pop(robot, None)
         else:
-            self._gone.setdefault(robot, time.monotonic())
+            self._went(robot)
         if before != info:
             self._on_change()
 
@@ -150,8 +154,15 @@ class Roster:
         info = self.robots.get(robot)
         if info is not None and info.online:
             self.robots[robot] = replace(info, online=False)
-            self._gone[robot] = time.monotonic()
+            self._went(robot)
             self._on_change()
+
+    def _went(self, robot: str) -> None:
+        """Note that a robot is offline from now on, unless it was before."""
+        self._gone.setdefault(robot, time.monotonic())
+        self.lost_ns.setdefault(robot, time.time_ns())
+        while len(self.lost_ns) > MOST_ROBOTS:
+            del self.lost_ns[next(iter(self.lost_ns))]
 
     async def _keep_sweeping(self) -> None:
         while True:

@@ -48,9 +48,10 @@ class Session:
         self._wire = wire
         self._sockets = SocketWatch.shared(config.lease_ms)
         doors = Doors(wire, self._sockets)
-        publishing, presence = Publishing(wire), Presence(wire)
+        presence = Presence(wire)
         direct = Direct(wire)
         self._answering, self._asking = Answering(wire, doors, direct), Asking(wire, doors, direct)
+        publishing = Publishing(wire, self._serve_backlog)
         self.put = publishing.put
         self.delete = publishing.delete
         self.flood = publishing.flood
@@ -83,6 +84,11 @@ class Session:
         Keys(fleet)
         raw = await asyncio.to_thread(link.open_raw, config, gateway)
         return cls(config, fleet, raw, asyncio.get_running_loop())
+
+    def _serve_backlog(self) -> None:
+        """Answer for what this session puts; one that never puts has no such queryable."""
+        backlog = self._wire.backlog
+        self._answering.serve(self.keys.backlog(str(self._wire.raw.zid())), backlog.answered, bulk=True)
 
     @property
     def linked(self) -> int:

@@ -69,6 +69,11 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Bound of each queue between Zenoh and the event loop; beyond it messages are dropped and counted."""
     queue_bytes: int = 128 * 2**20
     """The same in bytes."""
+    backlog_s: float = 10.0
+    """How long what was put is kept for a recorder that was not linked at that moment: it restarts in 2 s, and a link
+    that stood still is made anew within 3 s."""
+    backlog_bytes: int = 8 * 2**20
+    """Bound of the same in memory; 0: nothing is kept, and what a recorder misses is only counted."""
     concurrent_queries: int = 256
     """Queries answered at once per served key; more are refused with the reason."""
 
@@ -173,6 +178,8 @@ _LEAST: dict[str, float] = {
     "coalesce_most_ms": 1,
     "queue_messages": 100,
     "queue_bytes": 2**20,
+    "backlog_s": 0,
+    "backlog_bytes": 0,
     "concurrent_queries": 1,
 }
 

@@ -12,6 +12,7 @@ import structlog
 import zenoh
 
 from appliance.plane import link
+from appliance.plane.backlog import Backlog
 from appliance.plane.keys import Keys
 from appliance.plane.queues import Inbox, Outbox
 from appliance.plane.settings import PlaneConfig
@@ -48,6 +49,8 @@ class Wire:
         self.raw = raw
         self.source = zenoh.SourceInfo(raw.id, 0)
         """What questions of this session say of where they come from."""
+        self.backlog = Backlog(payload_bytes=config.backlog_bytes, seconds=config.backlog_s)
+        """What this session has put lately."""
         self.loop = loop
         self.refused: dict[str, int] = {}
         self.closed = False
@@ -64,13 +67,15 @@ class Wire:
     def _new_outbox(self) -> Outbox:
         return Outbox(messages=self.config.queue_messages, payload_bytes=self.config.queue_bytes)
 
-    def send(self, key: str, send: Callable[[], None], size: int, *, bulk: bool = False) -> None:
-        """Have the sender's thread send; what does not fit into its queue is counted."""
+    def send(self, key: str, send: Callable[[], None], size: int, *, bulk: bool = False) -> bool:
+        """Have the sender's thread send; False when it does not fit into its queue, which is counted."""
         outbox = self.outbox
         if bulk:
             outbox = self._bulk = self._bulk or self._new_outbox()
-        if not outbox.send(partial(link.quietly, send, key), size) and not self.closed:
+        queued = outbox.send(partial(link.quietly, send, key), size)
+        if not queued and not self.closed:
             self.refuse("outgoing queue full", key=key)
+        return queued
 
     def refuse(self, what: str, *, count: int = 1, **fields: Any) -> None:
         """Count bad input; logged the first ten times, then at powers of two: a flood does not fill the log."""

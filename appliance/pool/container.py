@@ -8,6 +8,7 @@ None of it needs Podman's API, so warm containers serve on while Podman is away.
 import asyncio
 import contextlib
 import os
+import signal
 import stat
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from typing import Any, cast
 
 import msgspec
 import structlog
+from msgspec import Struct
 
 from appliance.errors import DeadlineError, PayloadError, PoolError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState
@@ -109,6 +111,49 @@ class Connection:
         self._writer.close()
 
 
+class Ending(Struct, frozen=True, kw_only=True):
+    """How a container ended in mid-run, as the run's failure says it."""
+
+    code: str
+    message: str
+    remedy: str
+
+
+LOST = Ending(
+    code="pool",
+    message="the connection to its container was lost in mid-run, and Podman does not say why",
+    remedy="another container takes its place; the gateway's log says more",
+)
+
+
+def hung(silent_s: float, detail: str) -> Ending:
+    """Return how a container ended whose runner was ended by the watchdog after `silent_s` without an answer."""
+    return Ending(
+        code="hung",
+        message=f"the runner of its container did not answer for {silent_s:g} s ({detail}); the watchdog ended it",
+        remedy="look for what stopped its processes or starved them: load and memory of the gateway (`swiftbot fleet`)",
+    )
+
+
+def ending_of(code: int, *, oom: bool) -> Ending:
+    """Return how a container ended by what Podman says of its process 1: exit code, and whether memory ran out."""
+    if oom:
+        return Ending(
+            code="memory",
+            message="its container ran out of memory and was killed by the kernel",
+            remedy="raise memory_mb in its skill.toml",
+        )
+    how = f"was killed by {signal.Signals(code - 128).name}" if code - 128 in _SIGNALS else f"exited with code {code}"
+    return Ending(
+        code="pool",
+        message=f"its container {how} in mid-run",
+        remedy="another container takes its place; the gateway's log and the kernel's (out of memory?) say more",
+    )
+
+
+_SIGNALS = frozenset(int(each) for each in signal.Signals)
+
+
 class PooledContainer:
     """A container of the pool. The pool alone changes its `info`; reservation and times are the pool's notes."""
 
@@ -140,6 +185,9 @@ class PooledContainer:
         self._spare: Connection | None = None
         self._active: Connection | None = None
         self._closed = False
+        self._ending: Ending | None = None
+        self._ended = asyncio.Event()
+        """How it ended is known, or will not be."""
         self._replies: asyncio.Queue[Frame] = asyncio.Queue(maxsize=16)
         self._asking = asyncio.Lock()
         self._watcher: asyncio.Task[None] | None = None
@@ -275,9 +323,26 @@ class PooledContainer:
             except OSError as error:
                 raise UnreachableError(f"the runner of {self.id} is gone") from error
 
-    def close(self) -> None:
-        """Hang up; a run in progress is ended by its runner, and whoever listens to it sees the end of file."""
+    def tell_ending(self, ending: Ending | None) -> None:
+        """Note how it ended; None where that is not known."""
+        self._ending = self._ending or ending
+        self._ended.set()
+
+    async def ending(self, timeout_s: float) -> Ending:
+        """Return how it ended, once that is known; LOST when nobody says so in time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._ended.wait()
+        return self._ending or LOST
+
+    def close(self, *, told_later: bool = False) -> None:
+        """Hang up; a run in progress is ended by its runner, and whoever listens to it sees the end of file.
+
+        `told_later`: how it ended is being found out, and `tell_ending` follows.
+        """
         self._closed = True
+        if not told_later:
+            self._ended.set()
         self._on_death = None
         if self._watcher is not None:
             self._watcher.cancel()

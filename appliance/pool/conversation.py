@@ -22,7 +22,7 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.model import Failure, Phase, RunEvent, RunEventKind, RunRequest
-from appliance.pool.container import Connection, Frame
+from appliance.pool.container import Connection, Ending, Frame
 
 log = structlog.get_logger(__name__)
 
@@ -37,6 +37,8 @@ MAX_LINES = 2000
 """Log lines of one run that are passed on."""
 MAX_FIGURE = 1e12
 """Beyond it a figure of CPU time or memory is none."""
+MOST_CALLS = 10**9
+"""Beyond it the number of calls before a checkpoint is none."""
 MAX_CALLS = 8
 """Calls of one run in progress at once: a handler's threads may each make one."""
 ALIVE_S = 2.0
@@ -88,6 +90,28 @@ def _table(value: Any) -> dict[str, Any]:
     return cast("dict[str, Any]", value) if isinstance(value, dict) else {}
 
 
+_NAMES: dict[type, str] = {dict: "a table", float: "a number", int: "a whole number"}
+
+
+def _named(value: object) -> str:
+    """Return what a value is, in words."""
+    match value:
+        case None:
+            return "nothing"
+        case bool():
+            return "true or false"
+        case int() | float():
+            return "a number"
+        case str() | bytes():
+            return "a text" if isinstance(value, str) else "bytes"
+        case list():
+            return "a list"
+        case dict():
+            return "a table"
+        case _:
+            return f"a {type(value).__name__}"
+
+
 class Conversation:
     """Listens to one run to its end."""
 
@@ -103,8 +127,10 @@ class Conversation:
         on_event: Callable[[RunEvent], None],
         on_call: Callable[[Call], Awaitable[dict[str, Any]]],
         refused: Counter[str],
+        ending: Callable[[], Awaitable[Ending]],
     ) -> None:
         self._connection = connection
+        self._ending = ending
         self._request = request
         self._where = {"gateway": gateway, "container": container, "phase": phase}
         self._entered_ns = entered_ns
@@ -155,9 +181,8 @@ class Conversation:
             self._flush()
             for call in self._calls:
                 call.cancel()
-        return self.failed(
-            "pool", "the container died in mid-run", remedy="it is replaced; the gateway's log tells what became of it"
-        )
+        ending = await self._ending()
+        return self.failed(ending.code, ending.message, remedy=ending.remedy)
 
     async def _pace(self) -> None:
         """Let a run that floods its gateway wait."""
@@ -190,14 +215,16 @@ class Conversation:
             case "alive":
                 self._tell(self.event(RunEventKind.ALIVE))
             case "partial":
-                self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
+                if self._fits("partial result", frame.get("result"), dict):
+                    self._tell(self.event(RunEventKind.PARTIAL, result=_table(frame.get("result"))))
             case "checkpoint":
-                calls = int(_number(frame.get("calls")))
-                self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
+                self._checkpoint(frame)
             case "call":
                 await self._call(frame)
             case "result":
                 self._note_usage(frame)
+                if not isinstance(frame.get("result"), dict):
+                    return self._no_result(frame.get("result"))
                 return self.event(
                     RunEventKind.SUCCEEDED,
                     result=_table(frame.get("result")),
@@ -211,7 +238,34 @@ class Conversation:
                 raise PayloadError(f"the runner sent an unknown event {str(other)[:40]!r}")
         return None
 
+    def _checkpoint(self, frame: Frame) -> None:
+        """Pass a checkpoint on; one without a number of calls is none, since the next attempt counts on from it."""
+        calls = frame.get("calls", 0)
+        if not self._fits("checkpoint", frame.get("data"), dict) or not self._fits("checkpoint's calls", calls, int):
+            return
+        if not 0 <= calls <= MOST_CALLS:
+            self._refused["run news"] += 1
+            self._line({"text": "a checkpoint was left out: its number of calls is out of range"})
+            return
+        self._tell(self.event(RunEventKind.CHECKPOINT, result=_table(frame.get("data")), calls=calls))
+
+    def _fits(self, what: str, value: object, *kinds: type) -> bool:
+        """Whether news is of the type it should be; what is not is counted, left out, and told in the run's lines."""
+        if isinstance(value, kinds) and not isinstance(value, bool):
+            return True
+        self._refused["run news"] += 1
+        self._line({"text": f"a {what} was left out: it is {_named(value)}, not {_NAMES[kinds[0]]}"})
+        return False
+
+    def _no_result(self, value: object) -> RunEvent:
+        """Return the end of a run whose result is no table: what it did is not known."""
+        self._refused["result"] += 1
+        text = f"the result of {self._request.skill} is {_named(value)}, not a table"
+        return self.failed("payload", text, remedy="return a dict from run(ctx)", retryable=False)
+
     def _progress(self, frame: Frame) -> None:
+        if not self._fits("progress", frame.get("fraction", 0.0), float, int):
+            return
         fraction, note = _number(frame.get("fraction")), str(frame.get("note", ""))
         self._tell(self.event(RunEventKind.PROGRESS, progress=fraction, note=note))
 
@@ -242,7 +296,10 @@ class Conversation:
         if self._lines > MAX_LINES:
             self._refused["run output"] += 1
             return
-        fields = _table(frame.get("fields"))
+        given = frame.get("fields")
+        fields = _table(given)
+        if given is not None and not isinstance(given, dict):
+            self._refused["run news"] += 1  # its text is told without them
         self._on_event(self.event(RunEventKind.LOG, note=str(frame.get("text", "")), result=fields or None))
 
     def _note_usage(self, frame: Frame) -> None:
@@ -257,8 +314,8 @@ class Conversation:
         for line in cast("list[object]", trace) if isinstance(trace, list) else ():
             self._line({"text": str(line)})
         return self.failed(
-            str(frame.get("code", "internal")),
-            str(frame.get("message", "")),
+            str(frame.get("code") or "internal"),
+            str(frame.get("message") or "the handler failed and gave no reason"),
             remedy=str(frame.get("remedy", "")),
             retryable=bool(frame.get("retryable", False)),
         )
@@ -269,6 +326,11 @@ class Conversation:
             self._refused["call"] += 1
             error = {"code": "refused", "message": f"{MAX_CALLS} calls are in progress already", "retryable": True}
             await self._reply({"n": number, "error": error})
+            return
+        if not isinstance(frame.get("args", {}), dict):
+            self._refused["call"] += 1
+            text = f"the arguments of {str(frame.get('name'))[:40]!r} are {_named(frame.get('args'))}, not a table"
+            await self._reply(self._refusal(number, PayloadError(text), retryable=False))
             return
         call = Call(run=self._request, number=number, name=str(frame.get("name", "")), args=_table(frame.get("args")))
         task = asyncio.create_task(self._carry_out(call), name=f"call {self._request.run_id}/{number}")

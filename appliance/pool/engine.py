@@ -107,6 +107,15 @@ class FoundImage(Struct, frozen=True, kw_only=True):
     created: str
 
 
+class Exit(Struct, frozen=True, kw_only=True):
+    """How a container's process 1 ended."""
+
+    code: int
+    """Its exit status; 128 and the signal's number when one killed it."""
+    oom: bool
+    """Whether the kernel killed it because memory ran out."""
+
+
 class Engine(Protocol):
     """What the pool asks of a container engine."""
 
@@ -128,6 +137,18 @@ class Engine(Protocol):
 
     async def logs(self, container: str) -> str:
         """Return the end of what it wrote."""
+        ...
+
+    async def ended(self, container: str) -> Exit | None:
+        """Return how a container ended; None while it runs."""
+        ...
+
+    async def ping(self, timeout_s: float) -> None:
+        """Return when the engine answers; UnreachableError when it does not within `timeout_s`."""
+        ...
+
+    def hang_up(self) -> None:
+        """Ask for no sign of life any more; on the event loop."""
         ...
 
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
@@ -177,6 +198,8 @@ class PodmanEngine:
         self.path = socket_path(url)
         self._timeout_s = timeout_s
         self._threads = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="podman")
+        self._line: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        """The connection that signs of life come over."""
         self._local = threading.local()
         self._clients: list[Any] = []
         self.calls: Counter[str] = Counter()
@@ -290,6 +313,49 @@ class PodmanEngine:
             return await self._ask(f"logs of {container[:12]}", work)
         except (PoolError, UnreachableError, PrerequisiteError):
             return ""
+
+    async def ended(self, container: str) -> Exit | None:
+        """Return how a container ended; None while it runs. PoolError when it is not there."""
+
+        def work(client: Any) -> Exit | None:
+            response = client.api.get(f"/containers/{container}/json")
+            response.raise_for_status()
+            state = cast("dict[str, Any]", response.json()["State"])
+            if state.get("Running") or str(state.get("Status")) in ("running", "stopping"):
+                return None
+            return Exit(code=int(state.get("ExitCode", 0)), oom=bool(state.get("OOMKilled", False)))
+
+        return await self._ask(f"state of {container[:12]}", work)
+
+    async def ping(self, timeout_s: float) -> None:
+        """Ask Podman for a sign of life, on a connection of its own: the threads may all wait for it just then.
+
+        The connection is kept: Podman logs a warning for each that is closed.
+        """
+        line, self._line = self._line, None
+        try:
+            async with asyncio.timeout(timeout_s):
+                reader, writer = line or await asyncio.open_unix_connection(str(self.path))
+                try:
+                    writer.write(b"HEAD /_ping HTTP/1.1\r\nHost: d\r\n\r\n")
+                    await reader.readuntil(b"\r\n\r\n")
+                    self._line = (reader, writer)
+                finally:
+                    if self._line is None:
+                        writer.close()
+        except TimeoutError as error:
+            raise UnreachableError(
+                f"Podman has not answered within {timeout_s:g} s at its API socket {self.path}",
+                remedy="systemctl --user restart podman.service, as the service user; containers that run serve on",
+            ) from error
+        except (OSError, EOFError, ValueError, asyncio.LimitOverrunError) as error:
+            raise self._unreachable(error) from error
+
+    def hang_up(self) -> None:
+        """Close the connection that signs of life come over; on the event loop."""
+        if self._line is not None:
+            self._line[1].close()
+            self._line = None
 
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return the containers, running or not, that have all these labels."""

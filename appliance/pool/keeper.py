@@ -19,7 +19,7 @@ import structlog
 from appliance.errors import SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool.books import FOR_A_RUN, Books
-from appliance.pool.container import PooledContainer
+from appliance.pool.container import Ending, PooledContainer, ending_of, hung
 from appliance.pool.decisions import Decisions
 from appliance.pool.engine import LABEL_ID, Engine, EngineFacts
 from appliance.pool.link import EngineLink
@@ -40,6 +40,10 @@ TEND_AT_MOST_EVERY_S = 0.05
 CONNECT_WAIT_S = 10.0
 """How long a start waits for Podman; after that it goes on without."""
 SWEEP_S = 30.0
+ENDING_S = 2.0
+"""How long Podman is asked how a container ended in mid-run, before that counts as not known."""
+ENDING_LOOK_S = 0.1
+"""Pause between two such questions: it notices the end some 200 ms after the sockets are closed."""
 """How often Podman is asked whether it has containers of ours that are not in the books."""
 FIRST_SWEEP_S = 2.0
 """The first time after Podman was reached: what a killed gateway had asked for may have come after the adoption."""
@@ -75,12 +79,17 @@ class Keeper:
     ) -> None:
         self.decisions = Decisions()
         self.books = Books(config, begin=self._begin, on_change=on_change, refused=refused)
-        self.link = EngineLink(make_engine, reconnect_s=config.reconnect_s, on_connected=self._on_connected)
+        self.link = EngineLink(
+            make_engine,
+            reconnect_s=config.reconnect_s,
+            on_connected=self._on_connected,
+            on_problem=self.books.changed,
+        )
         self._config = config
         self._images = tuple(images)
         self._on_evicted = on_evicted
         self._wake = asyncio.Event()
-        self._starter = make_starter(lambda container: self.retire(container, "it died"))
+        self._starter = make_starter(lambda container: self.retire(container, "it died", died=True))
         self.starts = Starts(
             config, starter=self._starter, link=self.link, decisions=self.decisions, on_end=self._on_started
         )
@@ -140,7 +149,7 @@ class Keeper:
         """
         await self._starter.open()
         await self.link.start(CONNECT_WAIT_S)
-        for work in (self._tend_forever(), self.planning.memory.run()):
+        for work in (self._tend_forever(), self.planning.memory.run(), self.link.watch()):
             self._standing.append(asyncio.create_task(work, name=work.__qualname__))
 
     async def stop(self, *, keep_containers: bool, patience_s: float) -> None:
@@ -256,14 +265,34 @@ class Keeper:
             self.books.ready(container)
             self._wake.set()
 
-    def retire(self, container: PooledContainer, reason: str, *, serve: bool = True) -> None:
-        """Take a container out of the books at once and remove it in the background."""
+    def retire(
+        self,
+        container: PooledContainer,
+        reason: str,
+        *,
+        serve: bool = True,
+        ending: Ending | None = None,
+        died: bool = False,
+    ) -> None:
+        """Take a container out of the books at once and remove it in the background.
+
+        Args:
+            container: any of this pool.
+            reason: why, for the pool's decisions.
+            serve: whether those who wait are served at once.
+            ending: how it ended, for the run in it.
+            died: it ended by itself: where a run was in it Podman is asked how, before it is removed.
+        """
+        run = container.info.run
         if not self.books.drop(container):
             return
         self.decisions.note("retire", image=container.info.image, container=container.id, why=reason)
         container.become(ContainerState.DEAD)
-        container.close()
-        self.spawn(self._bury(container), f"remove {container.id}")
+        ask = died and bool(run) and self.link.engine is not None and not self.link.problem
+        if ending is not None:
+            container.tell_ending(ending)
+        container.close(told_later=ask)
+        self.spawn(self._bury(container, ask=ask), f"remove {container.id}")
         if serve:
             self.books.serve()
         self._wake.set()
@@ -274,13 +303,31 @@ class Keeper:
         if container is not None and container.info.state is ContainerState.READY:
             self.retire(container, reason, serve=serve)
 
-    async def _bury(self, container: PooledContainer) -> None:
+    async def _bury(self, container: PooledContainer, *, ask: bool = False) -> None:
+        if ask:
+            await self._ask_ending(container)
         try:
             await self._starter.remove(container, self.link.engine)
         except UnreachableError as error:
             self.link.lost(error)  # what is left is found by its label after reconnecting
         except SwiftbotError as error:
             log.warning("container was not removed", container=container.id, reason=str(error))
+
+    async def _ask_ending(self, container: PooledContainer) -> None:
+        """Ask Podman how a container ended; it notices that a moment after its sockets are closed."""
+        ending: Ending | None = None
+        try:
+            async with asyncio.timeout(ENDING_S):
+                while (engine := self.link.engine) is not None:
+                    found = await engine.ended(container.engine_id)
+                    if found is not None:
+                        ending = ending_of(found.code, oom=found.oom)
+                        break
+                    await asyncio.sleep(ENDING_LOOK_S)
+        except (TimeoutError, SwiftbotError) as error:
+            log.info("how a container ended is not known", container=container.id, reason=str(error) or "too slow")
+        finally:
+            container.tell_ending(ending)
 
     # --- tending ----------------------------------------------------------------------------------------------
 
@@ -334,7 +381,9 @@ class Keeper:
         except SwiftbotError as error:
             container.missed_probes += 1
             if container.missed_probes >= self._config.probe_failures:
-                self.retire(container, f"does not answer: {error.message}")
+                silent_s = container.missed_probes * self._config.probe_timeout_s
+                detail = f"{container.missed_probes} probes in a row"
+                self.retire(container, f"does not answer: {error.message}", ending=hung(silent_s, detail))
         finally:
             container.next_probe = time.monotonic() + self._config.probe_s
 

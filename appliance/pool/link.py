@@ -16,6 +16,10 @@ from appliance.pool.engine import Engine, EngineFacts
 log = structlog.get_logger(__name__)
 
 MAX_RECONNECT_S = 30.0
+WATCH_S = 0.5
+"""Pause between two signs of life that Podman is asked for."""
+ANSWER_S = 1.2
+"""How long it may take for one. Two in a row that do not come make it a problem, so within 3 s."""
 
 
 class EngineLink:
@@ -25,6 +29,7 @@ class EngineLink:
         make_engine: makes the connection's object; may raise SwiftbotError, and is then tried again.
         reconnect_s: first pause before another try; doubles up to MAX_RECONNECT_S.
         on_connected: awaited each time Podman answers (again), before it counts as there.
+        on_problem: called when `problem` has changed.
     """
 
     def __init__(
@@ -33,16 +38,57 @@ class EngineLink:
         *,
         reconnect_s: float,
         on_connected: Callable[[Engine, EngineFacts], Awaitable[None]],
+        on_problem: Callable[[], None] = lambda: None,
     ) -> None:
         self.engine: Engine | None = None
         self.facts: EngineFacts | None = None
-        self.problem = "not started"
-        """Why Podman cannot be used; empty when it can."""
+        self._problem = "not started"
+        self._on_problem = on_problem
+        self._silent = False
+        """Whether the problem is that Podman gives no sign of life."""
         self._make_engine = make_engine
         self._on_connected = on_connected
         self._first_pause_s = self._pause_s = reconnect_s
         self._try_at = 0.0
         self._connecting: asyncio.Task[None] | None = None
+
+    @property
+    def problem(self) -> str:
+        """Why Podman cannot be used; empty when it can."""
+        return self._problem
+
+    @problem.setter
+    def problem(self, text: str) -> None:
+        changed, self._problem = text != self._problem, text
+        if changed:
+            self._on_problem()
+
+    async def watch(self) -> None:
+        """Ask Podman for signs of life for ever: one that stands still is a problem before the next start needs it."""
+        missed = 0
+        while True:
+            if not missed:
+                await asyncio.sleep(WATCH_S)
+            engine = self.engine
+            if engine is None:
+                missed = 0
+                await asyncio.sleep(WATCH_S)
+                continue
+            try:
+                await engine.ping(ANSWER_S)
+            except SwiftbotError as error:
+                missed += 1
+                if missed >= 2:
+                    self._silent = True
+                    self.lost(error)
+                    await asyncio.sleep(WATCH_S)
+                continue
+            missed = 0
+            if self._silent:
+                # It answers again: what was put off is tried now.
+                self._silent = False
+                self._try_at, self._pause_s = 0.0, self._first_pause_s
+                self.tend(time.monotonic())
 
     async def start(self, wait_s: float) -> None:
         """Connect; what takes longer than `wait_s` goes on in the background."""
@@ -63,6 +109,7 @@ class EngineLink:
         """Let go of threads and connections."""
         engine, self.engine = self.engine, None
         if engine is not None:
+            engine.hang_up()
             await asyncio.to_thread(engine.close)
 
     def there(self) -> tuple[Engine, EngineFacts]:

@@ -22,7 +22,7 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
-from appliance.model import ContainerInfo, Need, Phase, RunEvent, RunRequest, Site, Way
+from appliance.model import ContainerInfo, Failure, Need, Phase, RunEvent, RunEventKind, RunRequest, Site, Way
 from appliance.pool.container import PooledContainer
 from appliance.pool.conversation import Call
 from appliance.pool.decided import eviction_case, selection_case, watched
@@ -38,7 +38,8 @@ from appliance.pool.starter import Starter
 from appliance.pool.state import ALONE, State
 from appliance.pool.turns import Turn, turn_of
 from appliance.pool.verbs import Verbs, unknown_image
-from appliance.skills.catalogue import Catalogue
+from appliance.skills.catalogue import Catalogue, SkillManifest
+from appliance.skills.outputs import broken_promises
 
 __all__ = ["Call", "Pool"]
 
@@ -312,7 +313,19 @@ class Pool:
             raise NotFoundError(f"skill {request.skill[:60]!r} is not implemented here", remedy="see docs/skills.md")
         if decision.phase is Phase.REMOTE_WARM and decision.gateway != self.gateway:
             raise RefusedError(f"the container chosen is on {decision.gateway}", remedy="send the run there")
-        return await self._runs.run(request, decision, on_event, turn or turn_of(request))
+        return self._checked(await self._runs.run(request, decision, on_event, turn or turn_of(request)), skill)
+
+    def _checked(self, final: RunEvent, skill: SkillManifest) -> RunEvent:
+        """Return a run's last event; a success whose result is not what the manifest promises becomes a failure."""
+        if final.kind is not RunEventKind.SUCCEEDED or not (broken := broken_promises(skill, final.result or {})):
+            return final
+        self.refused["result"] += 1
+        failure = Failure(
+            code="payload",
+            message=f"the result of {skill.id} is not what its manifest promises: {'; '.join(broken)}",
+            remedy=f"have the handler of {skill.id} return it, or correct `produces` and `results` in its skill.toml",
+        )
+        return msgspec.structs.replace(final, kind=RunEventKind.FAILED, result=None, failure=failure)
 
     def waiting(self) -> list[tuple[Turn, Need]]:
         """Return the runs that wait for a container, in the order in which they will be served; ids are run ids."""

@@ -24,6 +24,8 @@ from appliance.pool.turns import Turn
 
 BACKSTOP_S = 3.0
 """How much longer than the runner itself the pool waits for a run to end, before it ends the container."""
+ENDING_S = 3.0
+"""How long it is waited for Podman to say how a container ended, before its run is told as lost."""
 TRIES = 3
 """Containers that may be found dead at the moment a run is sent to them, before the run is given back."""
 
@@ -91,6 +93,7 @@ class Runs:
                     on_event=on_event,
                     on_call=self._on_call,
                     refused=self._refused,
+                    ending=lambda: container.ending(ENDING_S),
                 )
                 return await self._listen(request, run, container, connection, conversation)
         except CancelledByOperatorError as error:
@@ -205,10 +208,7 @@ class Runs:
                 ended = not conversation.broken
                 return final
         except TimeoutError:
-            code = "cancelled" if run.cancelled else "deadline"
-            return conversation.failed(
-                code, "the run did not end when told to; its container was ended", retryable=not run.cancelled
-            )
+            return self._given_up(request, run, conversation)
         finally:
             if ended and request.need.volumes:
                 # What it left running may still write: swept first, so that what is noted of its state is the end.
@@ -218,6 +218,20 @@ class Runs:
             else:
                 connection.close()
                 self._keeper.retire(container, "its run did not end as it should")
+
+    def _given_up(self, request: RunRequest, run: _Run, conversation: Conversation) -> RunEvent:
+        """Return the end of a run whose runner does not end it: the pool ends its container."""
+        grace_s = self._config.cancel_grace_s + BACKSTOP_S
+        if run.cancelled:
+            text = f"the handler did not answer for {grace_s:g} s after the cancel; the watchdog ended its container"
+            return conversation.failed("cancelled", text, retryable=False)
+        silent_s = request.deadline_s + grace_s
+        text = (
+            f"the handler did not answer for {silent_s:g} s (it was given {request.deadline_s:g} s, and its runner did "
+            "not end it either); the watchdog ended its container"
+        )
+        remedy = "raise timeout_s in its skill.toml, or find out what stopped or starved its processes"
+        return conversation.failed("deadline", text, remedy=remedy)
 
     async def _wind_up(self, container: PooledContainer, connection: Connection, conversation: Conversation) -> None:
         """After a run: wait until the runner has swept up, then give the container to the next."""

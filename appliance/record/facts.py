@@ -9,7 +9,8 @@ from msgspec import Struct, field
 class LoggedMessage(Struct, frozen=True):
     """One put (or delete, when `deleted`) on a key. `at_ns` is Zenoh's timestamp, or the arrival's without one.
 
-    `encoding` is Zenoh's (`application/json`, ...).
+    `encoding` is Zenoh's (`application/json`, ...). `source` and `number` are the Zenoh session that put it and its
+    number there (`plane.backlog`), where the sender gives it one; they are not kept in a log.
     """
 
     key: str
@@ -17,6 +18,8 @@ class LoggedMessage(Struct, frozen=True):
     payload: bytes
     encoding: str = ""
     deleted: bool = False
+    source: str = ""
+    number: int = 0
 
 
 class Gap(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -32,7 +35,11 @@ class Gap(Struct, frozen=True, kw_only=True, omit_defaults=True):
     last_key: str = ""
     """Key of the last message dropped, as a hint."""
     source: str = ""
-    """Of what was not heard: whose numbers have a hole, such as `log`, `run`, `transition` or `mavlink`."""
+    """Of what was not heard: whose numbers have a hole. `plane`: of a session of the fleet; `mavlink`: frames of a
+    vehicle that no gateway received, lost on its link or while its gateway was down; `log`, `run` and `transition`: of
+    senders whose sessions give no numbers."""
+    keys: dict[str, int] = {}
+    """The same count by kind of key, such as `gw/*/log`."""
 
 
 class Deletion(Struct, frozen=True, kw_only=True):
@@ -80,6 +87,12 @@ class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Messages not recorded, by reason."""
     not_heard: dict[str, int] = field(default_factory=dict[str, int])
     """Messages that never came here, by whose numbers they are missing from."""
+    fetched: int = 0
+    """Messages that did not reach it when they were put, and were fetched from their senders afterwards."""
+    missed: dict[str, int] = field(default_factory=dict[str, int])
+    """Messages of the fleet that are not in its log, dropped or not heard, by kind of key, such as `gw/*/log`."""
+    missed_at_ns: int = 0
+    """Time of the last of them; 0: none is missing."""
     redacted: int = 0
     """Messages from which a secret was taken."""
     incidents: int = 0
@@ -117,7 +130,11 @@ class LogInfo(Struct, frozen=True, kw_only=True):
     dropped: int = 0
     """Messages that the recorder could not write, by its own account in the log's gaps."""
     not_heard: int = 0
-    """Messages that never reached the recorder, by the numbers that speakers give to theirs."""
+    """Messages of the fleet that never reached the recorder, by the numbers that senders give to theirs."""
+    not_received: int = 0
+    """Frames that vehicles sent and no gateway received, by the numbers of their frames."""
+    missed: dict[str, int] = {}
+    """`dropped` and `not_heard` together, by kind of key."""
     attachments: tuple[str, ...] = ()
     """Names of what is attached: the configuration, the versions, plans."""
     incidents: tuple[Incident, ...] = ()

@@ -18,7 +18,7 @@ from appliance.record.openlog import Attached
 from appliance.record.redact import Redactor
 from appliance.record.sequences import Sequences
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
+from appliance.record.writer import VEHICLE, LogWriter
 
 MOST_KEYS = 50_000
 """Keys whose plan is remembered; beyond, all are worked out anew. Each task has some of its own."""
@@ -83,7 +83,8 @@ class Pipeline:
         clean = self.redactor.text(payload) if way.raw else self.redactor.json(payload)
         if clean is not payload:
             message = LoggedMessage(message.key, message.at_ns, clean, message.encoding, message.deleted)
-        if way.numbers and not message.deleted:
+        # A session that numbers what it puts is followed by those numbers, of whatever key; a vehicle has its own.
+        if way.numbers and not message.deleted and (not message.number or way.numbers == VEHICLE):
             hole = self._sequences.heard(way.numbers, message.key, clean)
             if hole is not None:
                 self.writer.miss(hole.source, hole.missing, hole.key, message.at_ns)

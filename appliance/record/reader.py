@@ -15,10 +15,11 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 
 from appliance.errors import RecordError
+from appliance.plane.backlog import UNKNOWN, kind_of
 from appliance.record.expressions import compile_expression
 from appliance.record.facts import ChannelInfo, Deletion, Gap, Incident, LoggedMessage, LogInfo
 from appliance.record.records import BROKEN, RecordStream, chunk_at, open_log
-from appliance.record.writer import METADATA
+from appliance.record.writer import METADATA, VEHICLE
 
 _GAPS = compile_expression("swiftbot/*/recorder/*/gap")
 _INCIDENTS = compile_expression("swiftbot/*/recorder/*/incident")
@@ -105,7 +106,8 @@ class _Account:
     """What the recorder itself wrote down: what is missing, and what happened."""
 
     def __init__(self) -> None:
-        self.dropped = self.not_heard = 0
+        self.dropped = self.not_heard = self.not_received = 0
+        self.missed: dict[str, int] = {}
         self.incidents: list[Incident] = []
 
     def gap(self, data: bytes) -> None:
@@ -113,10 +115,15 @@ class _Account:
             gap = msgspec.json.decode(data, type=Gap)
         except _MALFORMED:
             return
+        if gap.source == VEHICLE:
+            self.not_received += gap.dropped
+            return
         if gap.source:
             self.not_heard += gap.dropped
         else:
             self.dropped += gap.dropped
+        for kind, count in (gap.keys or {kind_of(gap.last_key) if gap.last_key else UNKNOWN: gap.dropped}).items():
+            self.missed[kind] = self.missed.get(kind, 0) + count
 
     def incident(self, data: bytes) -> None:
         with contextlib.suppress(*_MALFORMED):
@@ -165,6 +172,8 @@ def _by_streaming(path: Path) -> LogInfo:
         recovered=not stream.finished,
         dropped=account.dropped,
         not_heard=account.not_heard,
+        not_received=account.not_received,
+        missed=account.missed,
         attachments=tuple(attachments),
         incidents=tuple(account.incidents),
         problems=tuple(problems),
@@ -205,6 +214,8 @@ def _from_index(path: Path) -> LogInfo | None:
             end_ns=summary.statistics.message_end_time,
             dropped=account.dropped,
             not_heard=account.not_heard,
+            not_received=account.not_received,
+            missed=account.missed,
             attachments=tuple(each.name for each in summary.attachment_indexes),
             incidents=tuple(account.incidents),
             metadata=metadata,

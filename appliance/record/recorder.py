@@ -15,13 +15,16 @@ from msgspec import Struct, structs
 
 from appliance.errors import RecordError
 from appliance.model import encode
+from appliance.plane.backlog import kind_of
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.record.about import About
+from appliance.record.catching_up import CatchingUp, Tail, tail_of
 from appliance.record.facts import LoggedMessage, RecorderStatus
+from appliance.record.following import Lost
 from appliance.record.pipeline import Pipeline
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
+from appliance.record.writer import NOT_HEARD, PLANE, LogWriter, file_prefix
 
 log = structlog.get_logger(__name__)
 
@@ -44,6 +47,24 @@ class Drop(Struct, frozen=True):
     payload_bytes: int = 0
     key: str = ""
     at_ns: int = 0
+    keys: dict[str, int] = {}
+    """The same count by kind of key (`plane.backlog.kind_of`)."""
+
+    @classmethod
+    def of(cls, message: LoggedMessage) -> "Drop":
+        """One message that did not fit."""
+        return cls(1, len(message.payload), message.key, message.at_ns, {kind_of(message.key): 1})
+
+    def __add__(self, other: "Drop") -> "Drop":
+        """Both together; `other` is the later one."""
+        keys = self.keys | {kind: count + self.keys.get(kind, 0) for kind, count in other.keys.items()}
+        return Drop(
+            self.count + other.count,
+            self.payload_bytes + other.payload_bytes,
+            other.key or self.key,
+            other.at_ns,
+            keys,
+        )
 
 
 class Intake:
@@ -71,7 +92,7 @@ class Intake:
                 self._waiting.append(message)
                 self._bytes += size
         if full:
-            self.lose("queue full", Drop(1, size, message.key, message.at_ns))
+            self.lose("queue full", Drop.of(message))
         self._some.set()
         return not full
 
@@ -106,10 +127,7 @@ class Intake:
     def lose(self, reason: str, drop: Drop) -> None:
         """Count messages that were lost here or before they came here."""
         with self._lock:
-            old = self._drops.get(reason, Drop())
-            self._drops[reason] = Drop(
-                old.count + drop.count, old.payload_bytes + drop.payload_bytes, drop.key, drop.at_ns
-            )
+            self._drops[reason] = self._drops[reason] + drop if reason in self._drops else drop
 
     def take(self, wait_s: float) -> tuple[list[LoggedMessage], dict[str, Drop]]:
         """Return all that waits, and what was dropped since the last take, by reason."""
@@ -156,6 +174,9 @@ class Recorder:
         self._writer = writer or LogWriter(config, fleet=fleet, site=about.site, attached=about.attached)
         self._pipeline = Pipeline(config, fleet=fleet, writer=self._writer, secrets=about.secrets)
         self._intake = Intake(messages=config.queue_messages, payload_bytes=config.queue_bytes)
+        self._catching_up = CatchingUp(
+            session, put_all=self._intake.put_all, lose=self._lose_unheard, tail=self._recorded_before
+        )
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._subscription: Closer | None = None
@@ -176,8 +197,9 @@ class Recorder:
         await asyncio.to_thread(self._writer.prepare)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
+        self._catching_up.start()
         self._subscription = await asyncio.to_thread(
-            self._session.flood, self._session.keys.everything(), LoggedMessage, self._intake.put_all
+            self._session.flood, self._session.keys.everything(), LoggedMessage, self._catching_up.take
         )
         self._reporting = asyncio.create_task(self._report(), name="recorder status")
         log.info("recorder started", directory=str(self._config.folder), fleet=self._session.keys.fleet)
@@ -187,6 +209,7 @@ class Recorder:
         if self._subscription is not None:
             await asyncio.to_thread(self._subscription.close)
             self._subscription = None
+            await self._catching_up.close()
         if self._reporting is not None:
             self._reporting.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -226,7 +249,11 @@ class Recorder:
             if number % _TICK_EVERY == 0:
                 pipeline.tick()  # a file is flushed and ended when it is due, however much there is to do
         for reason, drop in drops.items():
-            self._writer.drop(reason, drop.key, drop.payload_bytes, drop.at_ns, count=drop.count)
+            if reason == NOT_HEARD:
+                self._writer.miss(PLANE, drop.count, drop.key, drop.at_ns, keys=drop.keys)
+            else:
+                size, at_ns = drop.payload_bytes, drop.at_ns
+                self._writer.drop(reason, drop.key, size, at_ns, count=drop.count, keys=drop.keys)
         pipeline.tick()
         self._moved_at = time.monotonic()
         if self._writer.recording or not self._writer.problem:
@@ -246,6 +273,9 @@ class Recorder:
             file_bytes=writer.file_bytes,
             dropped=dict(writer.dropped),
             not_heard=dict(writer.not_heard),
+            fetched=self._catching_up.fetched,
+            missed=dict(writer.missed),
+            missed_at_ns=writer.missed_at_ns,
             redacted=self._pipeline.redactor.count,
             incidents=self._pipeline.gate.incidents,
             last_incident=self._pipeline.gate.last,
@@ -267,6 +297,20 @@ class Recorder:
             if fresh > 0:
                 self._intake.lose(reason, Drop(fresh, at_ns=time.time_ns()))
             self._lost_before[reason] = now
+
+    def _lose_unheard(self, lost: Lost) -> None:
+        at_ns = lost.at_ns or time.time_ns()
+        self._intake.lose(NOT_HEARD, Drop(sum(lost.keys.values()), at_ns=at_ns, keys=lost.keys))
+
+    def _recorded_before(self) -> Tail:
+        """Return what the files of this recorder have of the last seconds: it may just have been restarted."""
+        now_ns = self._status.started_ns
+        if self._config.mode != "all":
+            return Tail(now_ns)  # what waited in memory for an incident is gone
+        prefix = file_prefix(self._session.keys.fleet, self._config.name)
+        before = {path.name for path in self._writer.files}
+        keep_s = self._session.config.backlog_s
+        return tail_of(self._config.folder, prefix, keep_s=keep_s, now_ns=now_ns, but=before)
 
     async def _report(self) -> None:
         while True:

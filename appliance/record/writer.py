@@ -8,7 +8,7 @@ happened meanwhile.
 
 import errno
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from appliance.errors import RecordError
 from appliance.model import Site
+from appliance.plane.backlog import UNKNOWN, kind_of
 from appliance.plane.keys import Keys
 from appliance.record.budget import make_room
 from appliance.record.facts import Gap, Incident, LoggedMessage
@@ -36,6 +37,13 @@ FOXGLOVE = "foxglove"
 """Name of the metadata record by which Foxglove knows whose recording it is (docs.foxglove.dev, "Manage data")."""
 NOT_HEARD = "not heard"
 """Reason of a gap that is not the recorder's doing."""
+PLANE = "plane"
+"""Source of what sessions have put and the recorder was not linked for (`record.following`)."""
+MOST_KINDS = 50
+"""Kinds of keys that misses are counted by; further ones are counted together."""
+OTHERS = "(others)"
+VEHICLE = "mavlink"
+"""Source of what vehicles have sent and no gateway received, by the numbers of their frames."""
 MOST_PLANS = 200
 """Attachments that wait for the next flush."""
 MOST_MARKS = 1_000
@@ -52,6 +60,14 @@ def file_prefix(fleet: str, name: str) -> str:
     folder, and the budget of one must not take the files of the other.
     """
     return f"{fleet.replace('-', '--')}-{name}-"
+
+
+def _added(kinds: dict[str, int], more: Mapping[str, int]) -> dict[str, int]:
+    """Add counts by kind of key to others, which are of `MOST_KINDS` kinds and `OTHERS` at most; returns them."""
+    for kind, count in more.items():
+        where = kind if kind in kinds or len(kinds) < MOST_KINDS else OTHERS
+        kinds[where] = kinds.get(where, 0) + count
+    return kinds
 
 
 class LogWriter:
@@ -88,6 +104,10 @@ class LogWriter:
         self.files: list[Path] = []
         self.dropped: dict[str, int] = {}
         self.not_heard: dict[str, int] = {}
+        self.missed: dict[str, int] = {}
+        """Messages of the fleet that are not in the log, whatever for, by kind of key."""
+        self.missed_at_ns = 0
+        """Time of the last of them; 0: none is missing."""
         self.removed = 0
         """Old files removed to stay within `total_bytes`."""
         self._prefix = file_prefix(fleet, config.name)
@@ -159,16 +179,30 @@ class LogWriter:
             return False
         return True
 
-    def drop(self, reason: str, key: str, size: int, at_ns: int, *, count: int = 1) -> None:
-        """Count messages that will not be in the log; a gap message tells of them as soon as one can be written."""
-        self.dropped[reason] = self.dropped.get(reason, 0) + count
-        self._note(Gap(reason=reason, dropped=count, payload_bytes=size, since_ns=at_ns, until_ns=at_ns, last_key=key))
+    def drop(
+        self, reason: str, key: str, size: int, at_ns: int, *, count: int = 1, keys: Mapping[str, int] | None = None
+    ) -> None:
+        """Count messages that will not be in the log; a gap message tells of them as soon as one can be written.
 
-    def miss(self, source: str, count: int, key: str, at_ns: int) -> None:
-        """Count messages that never came here; told in the log as those that were dropped are."""
+        `keys`: the same by kind of key; without, all are of the kind of `key`.
+        """
+        self.dropped[reason] = self.dropped.get(reason, 0) + count
+        kinds = self._count_missed(count, key, at_ns, keys)
+        gap = Gap(reason=reason, dropped=count, payload_bytes=size, since_ns=at_ns, until_ns=at_ns, last_key=key)
+        self._note(replace(gap, keys=kinds))
+
+    def miss(self, source: str, count: int, key: str, at_ns: int, *, keys: Mapping[str, int] | None = None) -> None:
+        """Count messages that never came here; told in the log as those that were dropped are.
+
+        Frames of a vehicle (source `mavlink`) were lost on its link, before the fleet had them: the gap is told, and
+        nothing of the fleet's is missing.
+        """
         self.not_heard[source] = self.not_heard.get(source, 0) + count
+        kinds = dict(keys or {kind_of(key): count})
+        if source != VEHICLE:
+            kinds = self._count_missed(count, key, at_ns, keys)
         gap = Gap(reason=NOT_HEARD, dropped=count, since_ns=at_ns, until_ns=at_ns, last_key=key, source=source)
-        self._note(gap)
+        self._note(replace(gap, keys=kinds))
 
     def mark(self, incident: Incident) -> None:
         """Write an incident down as soon as there is room for it, and have what leads up to it on the disk soon."""
@@ -228,6 +262,12 @@ class LogWriter:
                 return
             self._finish()
 
+    def _count_missed(self, count: int, key: str, at_ns: int, keys: Mapping[str, int] | None) -> dict[str, int]:
+        kinds = dict(keys or {kind_of(key) if key else UNKNOWN: count})
+        _added(self.missed, kinds)
+        self.missed_at_ns = max(self.missed_at_ns, at_ns)
+        return kinds
+
     # --- inside ------------------------------------------------------------------------------------------
 
     def _note(self, gap: Gap) -> None:
@@ -241,6 +281,7 @@ class LogWriter:
                 since_ns=min(old.since_ns, gap.since_ns),
                 until_ns=max(old.until_ns, gap.until_ns),
                 last_key=gap.last_key or old.last_key,
+                keys=_added(dict(old.keys), gap.keys),
             )
         self._gaps[gap.reason, gap.source] = gap
 

@@ -13,7 +13,7 @@ with file and key, because a manifest that is half understood fails later, in a 
 import hashlib
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -61,6 +61,27 @@ class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What its handler takes where a plan says nothing; None: nothing fixed. The safety policy looks at it."""
 
 
+class Output(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One value of a skill's result that others rely on."""
+
+    type: Literal["string", "number", "integer", "boolean", "array", "object", "any"]
+    required: bool = True
+    """Whether each result has it; one that is not required may be left out or null."""
+    description: str = ""
+
+
+_KINDS: dict[str, Literal["string", "number", "array", "object"]] = {
+    "number": "number",
+    "text": "string",
+    "detections": "array",
+    "frames": "array",
+    "path": "array",
+    "image": "object",
+    "video": "object",
+}
+"""What the values of these kinds of data are, in `produces`; of another kind they may be anything but null."""
+
+
 class Alternative(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A skill that may take the place of one that was given up."""
 
@@ -82,6 +103,9 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Actuators and sensors it occupies while it runs; two subtasks of a robot that share one are ordered."""
     consumes: tuple[Word, ...] = ()
     produces: tuple[Word, ...] = ()
+    """Kinds of data it makes; its result holds each under that name."""
+    results: dict[str, Output] = field(default_factory=dict[str, Output])
+    """What its result holds, by name; an entry named as one of `produces` is in place of that one's own type."""
 
     image: str
     """Image its handler runs in, a folder of `images/`."""
@@ -153,6 +177,11 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Whether `handler.py` is there. Set by the loader, never in the file."""
     folder: Path = Path()
     """Where it was read from. Set by the loader, never in the file."""
+
+    @property
+    def outputs(self) -> dict[str, Output]:
+        """What its result must hold, by name: one value for each of `produces`, and what `results` says."""
+        return {kind: Output(type=_KINDS.get(kind, "any")) for kind in self.produces} | self.results
 
     @property
     def mobility(self) -> Literal["anytime", "between commands", "never"]:
@@ -269,13 +298,16 @@ def _manifests(root: Path) -> Iterator[SkillManifest]:
                 f"{folder}: skill.toml is missing", remedy="write it as docs/skills.md shows, or remove the folder"
             )
         table = _read(file, {"implemented", "folder"})
-        manifest = convert(file, table, SkillManifest, rows=("params", Param))
+        manifest = convert(file, table, SkillManifest, rows={"params": Param, "results": Output})
         _check_name(file, "id", manifest.id, folder)
         if manifest.domain not in DOMAINS:
             raise _wrong(file, "domain", f"{manifest.domain!r} is none of {', '.join(DOMAINS)}")
         for param in manifest.params:
             if not _NAME.fullmatch(param):
                 raise _wrong(file, f"params.{param}", "a parameter's name is of a-z, 0-9 and '_'")
+        for output in manifest.results:
+            if not _NAME.fullmatch(output):
+                raise _wrong(file, f"results.{output}", "a result's name is of a-z, 0-9 and '_'")
         if manifest.runs == "compute" and manifest.verbs:
             raise _wrong(file, "verbs", "a skill that runs on no robot sends no robot commands")
         if manifest.speculate and (manifest.runs == "robot" or manifest.volumes):
@@ -391,21 +423,22 @@ def _read(file: Path, reserved: set[str]) -> dict[str, Any]:
 
 
 def convert(
-    file: Path, table: dict[str, Any], kind: type[_Kind], *, rows: tuple[str, type[Struct]] | None = None
+    file: Path, table: dict[str, Any], kind: type[_Kind], *, rows: Mapping[str, type[Struct]] | None = None
 ) -> _Kind:
     """Turn a table of a file into a struct; ConfigError with file and key where it does not fit.
 
-    `rows` is the key that holds tables by name, and their struct: msgspec tells no names there.
+    `rows` are the keys that hold tables by name, each with their struct: msgspec tells no names there.
     """
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        if rows is not None and isinstance(table.get(rows[0]), dict):
-            for name, row in table[rows[0]].items():
+        for key, row_kind in (rows or {}).items():
+            named: Any = table.get(key)
+            for name, row in named.items() if isinstance(named, dict) else ():  # pyright: ignore[reportUnknownVariableType]
                 try:
-                    msgspec.convert(row, rows[1])
+                    msgspec.convert(row, row_kind)
                 except msgspec.ValidationError as inner:
-                    raise _validation(file, inner, f"{rows[0]}.{name}") from inner
+                    raise _validation(file, inner, f"{key}.{name}") from inner
         raise _validation(file, error) from error
 
 

@@ -41,7 +41,7 @@ def load_site(where: str | Path) -> Site:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read: {error}", remedy="mend the TOML there") from error
     _check_keys(file, table)
-    site = convert(file, table, Site, rows=("places", Place))
+    site = convert(file, table, Site, rows={"places": Place})
     _check_places(file, site)
     _check_things(file, site)
     return site

@@ -12,7 +12,15 @@ from msgspec.structs import replace
 from appliance.errors import PayloadError, RefusedError
 from appliance.llm.intake import stop_refused
 from appliance.llm.stop_words import stop_request
-from appliance.model import HIGHEST_PRIORITY, LONGEST_DEADLINE_S, PLAIN_PRIORITY, Plan, TaskRequest
+from appliance.model import (
+    HIGHEST_PRIORITY,
+    LONGEST_DEADLINE_S,
+    PLAIN_PRIORITY,
+    SPLIT,
+    Plan,
+    TaskRequest,
+    oversize,
+)
 from appliance.plane.keys import check_name
 from appliance.tasks.bounds import MAX_DEPTH, too_deep
 from appliance.tasks.settings import TasksConfig
@@ -35,7 +43,12 @@ def checked(request: TaskRequest, config: TasksConfig) -> TaskRequest:
             remedy="split it, or raise tasks.max_instruction_chars",
         )
     if len(request.submitter) > MAX_SUBMITTER:
-        raise PayloadError(f"the submitter's name has more than {MAX_SUBMITTER} characters")
+        raise PayloadError(
+            f"the submitter's name has {len(request.submitter)} characters, at most {MAX_SUBMITTER} are possible",
+            remedy="use a shorter one",
+        )
+    if request.plan is not None and (problem := oversize(len(request.plan.subtasks))):
+        raise PayloadError(problem, remedy=SPLIT)
     if request.plan is not None and any(too_deep(each.params) for each in request.plan.subtasks):
         raise PayloadError(f"parameters are nested more than {MAX_DEPTH} deep", remedy="write them flat")
     if not 0 <= request.priority <= HIGHEST_PRIORITY:

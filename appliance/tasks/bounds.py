@@ -52,8 +52,9 @@ def result_problem(result: dict[str, Any] | None, *, max_bytes: int) -> Failure 
     if size > max_bytes:
         return Failure(
             code="payload",
-            message=f"the result has {size:,} bytes, more than {max_bytes:,}",
-            remedy="have the handler put it into an artifact",
+            message=f"the result has {size:,} bytes of JSON, at most {max_bytes:,} (tasks.max_result_bytes) are kept",
+            remedy="have the handler write it into a volume of the skill, or keep it with ctx.put_artifact, and return "
+            "where it is",
         )
     return None
 

@@ -9,7 +9,7 @@ import asyncio
 import base64
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, cast
 
 import msgspec
@@ -27,6 +27,7 @@ from appliance.robots.sending import send_command
 from appliance.tasks.api import ArtifactAsk, ArtifactPiece
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.bounds import MAX_RUN_S, clean
+from appliance.tasks.placement import waits_for_lost
 from appliance.tasks.steering.enquiries import Enquiries, enquiry_of
 
 log = structlog.get_logger(__name__)
@@ -38,6 +39,8 @@ HEARD_S = 0.5
 """How long after a command was cancelled a soft stop may still be on its way here."""
 ANSWER_S = 240.0
 """How long people are waited for when a handler does not say."""
+LOST_LOOK_S = 1.0
+"""How often a command that waits for its answer looks whether its robot is still there."""
 BUSY_RETRY_S = 0.5
 """Pause before a busy robot is asked again."""
 
@@ -111,9 +114,13 @@ class Calls:
             sent = self._orders(run.robot, command, CHOSEN - run.params.keys(), begun)
             left = give_up - time.monotonic()
             doubtful = self._plane.registry.doubtful(run.robot)
-            reply = await send_command(
-                self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful,
-                on_silence=lambda note: self._on_wait(call, note),
+            reply = await self._noting_loss(
+                call,
+                run.robot,
+                send_command(
+                    self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful,
+                    on_silence=lambda note: self._on_wait(call, note),
+                ),
             )  # fmt: skip
             if reply.failure is None:
                 return _answer(reply)
@@ -127,6 +134,24 @@ class Calls:
                 raise error
             self._on_wait(call, f"waits for {run.robot}: {reply.failure.message}")
             await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _noting_loss(self, call: Call, robot: str, sending: Coroutine[Any, Any, RobotReply]) -> RobotReply:
+        """Wait for a robot's answer, and tell when the robot is lost meanwhile, and when it is back."""
+        registry = self._plane.registry
+        answer = asyncio.ensure_future(sending)
+        lost = False
+        try:
+            while not (await asyncio.wait({answer}, timeout=LOST_LOOK_S))[0]:
+                info = registry.robots.get(robot)
+                gone = info is None or not info.online
+                if gone and not lost:
+                    self._on_wait(call, waits_for_lost(robot, info, registry.lost_ns.get(robot)))
+                elif lost and not gone:
+                    self._on_wait(call, f"{robot} is back")
+                lost = gone
+            return answer.result()
+        finally:
+            answer.cancel()
 
     async def _until_free(self, call: Call, robot: str, give_up: float) -> None:
         """Wait while a robot is stopped or an operator has it; RobotError when that lasts too long."""

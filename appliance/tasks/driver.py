@@ -78,6 +78,8 @@ class Driver:
         """Whether the task has ended and its last record is written; one that is final only here has not."""
         self._give_up = give_up
         """Why the task is to be ended instead of driven: earlier drivers of it broke."""
+        self.ending = asyncio.Event()
+        """The task ends or has ended by its written record, or this driver has done with it."""
         self._inbox: asyncio.Queue[Input] = asyncio.Queue()
         self._keeper = Keeper(around.plane, record, version, on_change, elapsed_s)
         self._keeper.unknown = unknown or Unknown()
@@ -137,7 +139,7 @@ class Driver:
             await self._resume()
             while not self.record.state.final:
                 self._advance()
-                await self._keeper.flush()
+                await self._flush()
                 if self.record.state.final:
                     break
                 await self._handle(await self._next())
@@ -147,17 +149,23 @@ class Driver:
                 if time.monotonic() >= self._checking.next_at:
                     self._look_ahead(time.monotonic())
                     await self._checking.check()
-            await self._keeper.flush()
+            await self._flush()
             self.ended = True
             await self._around.forget_checkpoints(self.record)
         except SupersededError as error:
             log.info("task is coordinated elsewhere", task=self.record.id, reason=error.message)
         finally:
+            self.ending.set()
             self._replanning.close()
             self._steering.close()
             for news in self._left():
                 news.refuse(UnreachableError("the task's coordination has ended here", remedy="ask again"))
             self._orders.close()
+
+    async def _flush(self) -> None:
+        await self._keeper.flush()
+        if self.told.state is TaskState.CANCELLING or self.told.state.final:
+            self.ending.set()
 
     async def _next(self) -> Input:
         try:

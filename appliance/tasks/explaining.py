@@ -15,7 +15,7 @@ from appliance.tasks.deadline import left_s
 from appliance.tasks.durations import Durations
 from appliance.tasks.hints import expected_starts
 from appliance.tasks.scheduling import Scheduler
-from appliance.tasks.why import CandidateWhy, TaskWhy, Waits, why, with_waits
+from appliance.tasks.why import WAITS, CandidateWhy, TaskWhy, Waits, why, with_waits
 
 STATUS_S = 1.0
 MOST_ASKED = 32
@@ -66,7 +66,8 @@ def _waits(
     name = target.subtask.id
     match target.state:
         case SubtaskState.RUNNING:
-            return Waits(reason="nothing: it runs")
+            held = target.note.startswith(WAITS)
+            return Waits(reason=target.note.removeprefix(WAITS) if held else "nothing: it runs")
         case SubtaskState.WAITING:
             open_ones = [each for each in target.subtask.after if not record.of(each).state.final]
             return Waits(reason=f"comes after {', '.join(open_ones)}", expected_s=_rounded(starts.get(name)))
@@ -98,7 +99,7 @@ def _waits(
     elif not reason:
         reason = target.note or "nothing: it is being sent"
     return Waits(
-        reason=reason,
+        reason=reason.removeprefix(WAITS),
         position=place.position,
         waiting=place.waiting,
         expected_s=_rounded(place.expected_s),

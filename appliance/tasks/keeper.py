@@ -14,6 +14,7 @@ from appliance.plane.node import Plane
 from appliance.tasks import machine
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.remedies import remedied
 from appliance.tasks.surroundings import task_key
 from appliance.tasks.unknown import Unknown, with_unknown
 
@@ -71,7 +72,9 @@ class Keeper:
         return not here and not self._pending and not self._dirty
 
     def transition(self, kind: TransitionKind, **fields: Any) -> Transition:
-        """Return the next transition of the record."""
+        """Return the next transition of the record; a failure in it without a remedy is given that of its code."""
+        if (failure := fields.get("failure")) is not None:
+            fields["failure"] = remedied(failure, self.record.id)
         return Transition(
             task=self.record.id,
             sequence=self.record.sequence + 1,

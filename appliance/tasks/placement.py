@@ -10,6 +10,7 @@ no candidate. Ties go to the gateway that asks: it is a network hop nearer.
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 
 from msgspec import Struct
 
@@ -150,6 +151,15 @@ def warmth(need: Need, containers: Iterable[ContainerInfo]) -> float:
     return best
 
 
+def waits_for_lost(name: str, robot: RobotInfo | None, lost_ns: int | None) -> str:
+    """Return what waits for a robot that is offline, in words: since when, and what it holds."""
+    if lost_ns is None:
+        return f"waits for {name}: {'offline' if robot else 'not in the roster'}"
+    since = datetime.fromtimestamp(lost_ns / 1e9, UTC)
+    holds = f", while it held the {robot.holding}" if robot is not None and robot.holding else ""
+    return f"waits for robot {name}, lost since {since:%H:%M:%S} UTC{holds}"
+
+
 def bind(
     label: str,
     records: Sequence[SubtaskRecord],
@@ -160,6 +170,7 @@ def bind(
     busy: frozenset[str],
     hindrance: Callable[[str], str] = lambda _: "",
     shuns: Callable[[SubtaskRecord, str], str] = lambda _subtask, _robot: "",
+    lost_ns: Mapping[str, int] | None = None,
 ) -> tuple[str | None, str]:
     """Choose the robot behind `any`, `any1`, ... or confirm a named one.
 
@@ -171,6 +182,7 @@ def bind(
         verbs: subtask id -> commands it needs.
         busy: robots with a run in progress, chosen last; those of other labels of this task are not chosen.
         hindrance: why tasks may not command a robot just now: a soft stop, a lease; "" when they may.
+        lost_ns: when robots that are offline were lost, Unix nanoseconds, as far as that is known.
         shuns: why a robot should not be given a subtask while another can do it, by experience; "" if nothing is.
 
     Returns:
@@ -185,7 +197,7 @@ def bind(
     if bound is not None:
         robot = robots.get(bound)
         if robot is None or not robot.online:
-            return None, f"waits for {bound}: {'offline' if robot else 'not in the roster'}"
+            return None, waits_for_lost(bound, robot, (lost_ns or {}).get(bound))
         for each in mine:
             if not each.state.final:
                 asked = (uses.get(each.subtask.id, ()), verbs.get(each.subtask.id, ()))

@@ -44,7 +44,8 @@ class Plans:
         context = self._context(record.instruction, submitter=record.submitter)
         if record.plan is not None:
             if problems := self._decomposer.review(record.plan, context).problems:
-                raise PlanError("the plan handed in is not valid", problems=problems)
+                remedy = "correct what the message lists and submit the plan again"
+                raise PlanError("the plan handed in is not valid", remedy=remedy, problems=problems)
             return record.plan
         return (await self._decomposer.plan(context)).plan
 

@@ -1,6 +1,7 @@
 """Questions about tasks, and the wish to end one: answered here where the task is driven, else by whoever drives it."""
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Mapping
 
@@ -20,6 +21,9 @@ from appliance.tasks.scheduling import Scheduler
 from appliance.tasks.steering.api import CancelTaskAsk
 from appliance.tasks.surroundings import CancelAsked, task_key
 from appliance.tasks.why import TaskWhy, why
+
+CANCEL_S = 1.5
+"""How long the answer to a cancel waits for the record that it makes: less than whoever asks waits for the answer."""
 
 
 class Questions:
@@ -71,7 +75,7 @@ class Questions:
         return await newest_tasks(self._plane, ask, [driver.record for driver in self._drivers.values()])
 
     async def cancel(self, ask: CancelTaskAsk) -> TaskRecord:
-        """Stop a task wherever it is coordinated; returns its record at that moment."""
+        """Stop a task wherever it is coordinated; returns the record that came of it: see `cancel_here`."""
         if ask.id in self._drivers:
             return await self.cancel_here(ask)
         record = await self.task(TaskAsk(id=ask.id))
@@ -84,11 +88,22 @@ class Questions:
         return await self._plane.rpc.call(owner, "cancel_here", ask, TaskRecord)
 
     async def cancel_here(self, ask: CancelTaskAsk) -> TaskRecord:
-        """Stop a task that is coordinated here; waits a moment for a driver that is being set up."""
+        """Stop a task that is coordinated here; waits a moment for a driver that is being set up.
+
+        Returns the record as it is written then: cancelled, cancelling while runs are being ended, or how it had ended
+        before the cancel came.
+
+        Raises:
+            UnreachableError: nobody coordinates it just now.
+        """
         for _ in range(20):
             if driver := self._drivers.get(ask.id):
                 driver.tell(CancelAsked(Word(by=ask.by, why=ask.why, act=ask.act, at_ns=time.time_ns())))
-                return driver.record
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(CANCEL_S):
+                        await driver.ending.wait()
+                # One that is not written in time stays noted: the record says that it is not confirmed.
+                return await self.task(TaskAsk(id=ask.id))
             record = await self.task(TaskAsk(id=ask.id))
             if record.state.final:
                 return record

@@ -142,7 +142,8 @@ def rest_of(record: TaskRecord, proposed: Plan) -> Plan:
     }
     rest = [each for each in spliced.plan.subtasks if each.id not in begun]
     if not rest:
-        raise PlanError("the new plan has nothing left to do", problems=("plan what is to be done instead",))
+        problems = ("plan what is to be done instead",)
+        raise PlanError("the new plan has nothing left to do", remedy="submit it as a new task", problems=problems)
     ids = {each.id for each in rest}
     return replace(
         proposed, subtasks=tuple(replace(each, after=tuple(one for one in each.after if one in ids)) for each in rest)

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from msgspec.structs import replace
 
 from appliance.model import (
+    MAX_SUBTASKS,
     Dropped,
     Plan,
     Proposal,
@@ -37,8 +38,6 @@ KEPT_REVISIONS = 8
 KEPT_PLANS = 3
 """Of those, how many with the plan before: a plan takes up to 20 kB."""
 MAX_INSTEAD_OF = 8
-MAX_SUBTASKS = 64
-"""As many as any plan may have (`llm.checks.schema`)."""
 
 _KINDS = {
     TransitionKind.REBOUND: RevisionKind.ROBOT,

@@ -101,6 +101,7 @@ class Scheduler:
             busy=self.busy_robots(),
             hindrance=self._hindrance,
             shuns=lambda each, robot: self._shuns(each.subtask.skill, robot),
+            lost_ns=self._plane.registry.lost_ns,
         )
 
     def busy_robots(self) -> frozenset[str]:

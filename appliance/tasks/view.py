@@ -8,6 +8,7 @@ from typing import Any
 from msgspec import Struct
 
 from appliance.model import Decision, Failure, Group, Proposal, Revision, SubtaskRecord, TaskRecord, Word
+from appliance.tasks.why import waits_for
 
 
 class SubtaskView(Struct, frozen=True, kw_only=True):
@@ -73,6 +74,8 @@ class TaskView(Struct, frozen=True, kw_only=True):
     """The last word of an operator on a plan of it."""
     paused: str | None
     """Why no subtask is started."""
+    waits: str | None
+    """What it or its subtasks wait for: an operator's approval, a robot that was lost, room."""
     cancelled_by: Word | None
     retried_by: Word | None
     subtasks: tuple[SubtaskView, ...]
@@ -104,6 +107,7 @@ def view(record: TaskRecord) -> TaskView:
         proposal=record.proposal,
         decision=record.decision,
         paused=record.paused or None,
+        waits=waits_for(record) or None,
         cancelled_by=record.cancelled_by,
         retried_by=record.retried_by,
         subtasks=tuple(_subtask(each) for each in record.subtasks),

@@ -11,6 +11,9 @@ from msgspec.structs import replace
 from appliance.errors import NotFoundError
 from appliance.model import PLAIN_PRIORITY, Attempt, Choice, Failure, Group, SubtaskRecord, TaskRecord, TaskState
 
+WAITS = "waits for "
+"""How the note of a subtask begins that waits for something outside of the task."""
+
 
 class AttemptWhy(Struct, frozen=True, kw_only=True):
     """One attempt; `choice` is None where it was never served, or by a version that did not tell."""
@@ -78,7 +81,7 @@ class TaskWhy(Struct, frozen=True, kw_only=True):
     group: Group | None = None
     """The gateways that serve it, its root, and how that came about."""
     waits: str = ""
-    """What the task as a whole waits for: an operator's approval, the end of a pause."""
+    """What the task or subtasks of it wait for: an operator's approval, the end of a pause, a robot that was lost."""
 
 
 def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
@@ -104,10 +107,13 @@ def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
 
 
 def waits_for(record: TaskRecord) -> str:
-    """What a task as a whole waits for, in words; empty when it is nothing."""
+    """What a task or subtasks of it wait for, in words; empty when it is nothing."""
     if record.state is TaskState.PROPOSED and record.proposal is not None:
         return f"an operator to approve its plan {record.proposal.hash[:12]}: {record.proposal.note}"
-    return record.paused
+    if record.state is not TaskState.RUNNING or record.paused:
+        return record.paused
+    notes = [each.note for each in record.subtasks if not each.state.final and each.note.startswith(WAITS)]
+    return "; ".join(dict.fromkeys(note.removeprefix(WAITS) for note in notes))
 
 
 def with_waits(found: TaskWhy, waits: Mapping[str, Waits], *, left_s: float | None) -> TaskWhy:

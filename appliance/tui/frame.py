@@ -198,7 +198,7 @@ class FleetScreen(Screen[None], inherit_bindings=False):
 
     def _count(self, store: Store) -> tuple[int, str]:
         """Return how many tasks go on, and in words what must not be overlooked on any screen."""
-        seen = (store, store.revisions(("tasks", "enquiries", "stops")), store.robots.arrangement)
+        seen = (store, store.revisions(("tasks", "enquiries", "stops", "recorders")), store.robots.arrangement)
         if self._counted[0] != seen:
             active = [record for record in store.tasks.values() if not record.state.final]
             waiting = sum(record.proposal is not None and record.proposal.waits for record in active)
@@ -207,6 +207,8 @@ class FleetScreen(Screen[None], inherit_bindings=False):
             if store.stops.active:
                 held = sum(store.stops.of(name) is not None for name in store.robots)
                 parts.insert(0, "■ ALL STOPPED" if held == len(store.robots) else f"■ {held} stopped")
+            if missed := sum(sum(each.missed.values()) for each in store.recorders.values()):
+                parts.append(f"▲ log misses {missed:,}")
             self._counted = (seen, len(active), " · ".join(parts))
         return self._counted[1], self._counted[2]
 

@@ -245,12 +245,12 @@ async def _next_run_works(bench: Bench, pool: Pool) -> RunEvent:
         ("fill scratch", "skill", "No space left on device"),
         ("fill volume", "skill", "File too large"),
         ("1 GB", "memory", "ran out of its memory"),
-        ("5 MB", "payload", "4194304 allowed"),
+        ("5 MB", "payload", "at most 4,194,304 (4 MiB)"),
         ("class", "skill", "object cannot be sent"),
         ("list", "skill", "returned list, not a dict"),
         ("nan", "skill", "Out of range float"),
         ("no text", "skill", "surrogates not allowed"),
-        ("large checkpoint", "payload", "262144 allowed"),
+        ("large checkpoint", "payload", "at most 262,144 (0.25 MiB)"),
         ("close", "crashed", "no result"),
         ("garbage", "payload", "garbage"),
         ("endless frame", "payload", "cut off within a message"),
@@ -425,6 +425,7 @@ async def test_killed_by_podman(bench: Bench, pool: Pool) -> None:
     final = await task
     assert final.failure is not None
     assert (final.failure.code, final.failure.retryable) == ("pool", True)
+    assert "was killed by SIGKILL in mid-run" in final.failure.message
     await _next_run_works(bench, pool)
     assert victim not in await engine_ids(bench.fleet)
 
@@ -437,7 +438,9 @@ async def test_frozen_in_mid_run(bench: Bench, pool: Pool) -> None:
     os.kill(pid, signal.SIGSTOP)
     final = await task
     assert final.failure is not None
-    assert (final.failure.code in ("pool", "deadline"), final.failure.retryable) == (True, True)
+    assert (final.failure.code in ("hung", "deadline"), final.failure.retryable) == (True, True)
+    assert "did not answer for" in final.failure.message
+    assert "watchdog" in final.failure.message
     await _next_run_works(bench, pool)
     async with asyncio.timeout(30):
         while Path(f"/proc/{pid}").exists():

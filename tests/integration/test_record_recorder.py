@@ -29,12 +29,16 @@ from appliance.record.writer import LogWriter
 pytestmark = pytest.mark.anyio
 
 PROCESS = """
-import asyncio, sys
+import asyncio, signal, sys
 from appliance.plane.settings import PlaneConfig
 from appliance.record.recorder import run_recorder
 from appliance.record.settings import RecordConfig
 config = RecordConfig(directory=sys.argv[2], free_bytes=0, status_s=0.2)
-asyncio.run(run_recorder(config, PlaneConfig(mode="client", connect=(sys.argv[1],)), "f1", asyncio.Event()))
+async def go():
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    await run_recorder(config, PlaneConfig(mode="peer", connect=(sys.argv[1],)), "f1", stop)
+asyncio.run(go())
 """
 
 
@@ -51,9 +55,10 @@ def _client(gateway: Session) -> PlaneConfig:
 
 
 async def _until(condition: Callable[[], object]) -> None:
-    """Wait until something is so; the test's own timeout bounds it."""
-    while not condition():
-        await asyncio.sleep(0.02)
+    """Wait until something is so, for a minute at most."""
+    async with asyncio.timeout(60):
+        while not condition():
+            await asyncio.sleep(0.02)
 
 
 @contextlib.asynccontextmanager
@@ -223,6 +228,119 @@ async def test_killed_recorder_loses_at_most_a_second(gateway: Session, tmp_path
     with (tmp_path / "whole.mcap").open("rb") as stream:
         again = [message for _, channel, message in make_reader(stream).iter_messages(gateway.keys.transition("t1"))]
     assert len(again) == len(numbers)
+
+
+def _numbers_in(folder: Path, keys: str) -> list[int]:
+    """The numbers in all files of a folder, in the order of the files and as they stand there."""
+    files = sorted(folder.glob("*.mcap"))
+    found = (message for path in files for message in read(path, keys=keys, problems=[]))
+    return [msgspec.json.decode(message.payload)["n"] for message in found]
+
+
+@contextlib.asynccontextmanager
+async def _recorder_process(
+    gateway: Session, folder: Path, project_root: Path
+) -> AsyncIterator[tuple[asyncio.subprocess.Process, list[RecorderStatus]]]:
+    """Run a recorder in a process of its own, heard of before the body runs; killed if it still runs afterwards."""
+    heard: list[RecorderStatus] = []
+    closer = gateway.subscribe_typed(
+        gateway.keys.recorder_status(), RecorderStatus, lambda _, status: heard.append(status) if status else None
+    )
+    environment = os.environ | {"PYTHONPATH": str(project_root)}
+    arguments = ("-c", PROCESS, gateway.config.listen[0], str(folder))
+    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
+    try:
+        await _until(lambda: heard and heard[-1].messages)
+        yield process, heard
+    finally:
+        closer.close()
+        if process.returncode is None:
+            process.send_signal(signal.SIGKILL)
+            await process.wait()
+
+
+async def _stand_still(gateway: Session, process: asyncio.subprocess.Process, put: Callable[[], None]) -> None:
+    """Stop the recorder until the gateway has let go of its link, put meanwhile, and let it go on."""
+    process.send_signal(signal.SIGSTOP)
+    try:
+        while gateway.linked:
+            put()
+            await asyncio.sleep(0.01)
+        put()
+    finally:
+        process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+async def test_what_is_put_while_the_recorder_stands_still(
+    free_port: int, tmp_path: Path, project_root: Path, kept: bool
+) -> None:
+    """A recorder that stood still for longer than a lease fetches what it lacks, or says how much of which keys.
+
+    It is in its place in the log: between what was before and what came after, each message once.
+    """
+    settings = PlaneConfig(listen=(f"tcp/127.0.0.1:{free_port}",), backlog_bytes=PlaneConfig().backlog_bytes * kept)
+    gateway = await Session.open(settings, "f1")
+    count = 0
+
+    def put() -> None:
+        nonlocal count
+        gateway.put(gateway.keys.transition("t1"), encode({"n": count}))
+        count += 1
+
+    try:
+        async with _recorder_process(gateway, tmp_path, project_root) as (process, heard):
+            await _stand_still(gateway, process, put)
+            await _until(lambda: gateway.linked)
+            await _until(lambda: (put(), heard[-1].fetched or heard[-1].missed)[1])
+            last = heard[-1]
+            recorded = last.messages
+            await _until(lambda: heard[-1].messages > recorded)
+            process.send_signal(signal.SIGTERM)
+            await process.wait()
+    finally:
+        await gateway.close()
+    numbers = _numbers_in(tmp_path, gateway.keys.transition())
+    assert numbers == sorted(set(numbers))
+    missing = numbers[-1] + 1 - len(numbers)
+    if kept:
+        assert (missing, last.missed) == (0, {})
+    else:
+        assert missing > 0
+        assert set(last.missed) == {"task/*/transition"}
+        assert last.missed["task/*/transition"] == missing
+        (path,) = tmp_path.glob("*.mcap")
+        assert info(path).missed == last.missed
+
+
+async def test_what_is_put_while_the_recorder_is_restarted(
+    gateway: Session, tmp_path: Path, project_root: Path
+) -> None:
+    """A recorder that is killed and started again has what was put between, each message once."""
+    count = 0
+
+    def put() -> None:
+        nonlocal count
+        gateway.put(gateway.keys.transition("t1"), encode({"n": count}))
+        count += 1
+
+    async with _recorder_process(gateway, tmp_path, project_root) as (process, heard):
+        for _ in range(50):
+            put()
+        before = heard[-1].messages
+        await _until(lambda: heard[-1].messages >= before + 50)
+        process.send_signal(signal.SIGKILL)
+        await process.wait()
+    for _ in range(200):
+        put()
+        await asyncio.sleep(0.001)
+    async with _recorder_process(gateway, tmp_path, project_root) as (process, heard):
+        await _until(lambda: (put(), heard[-1].fetched)[1])
+        process.send_signal(signal.SIGTERM)
+        await process.wait()
+    numbers = _numbers_in(tmp_path, gateway.keys.transition())
+    assert numbers == list(range(numbers[-1] + 1))
+    assert len(numbers) > 250
 
 
 async def test_file_size_limit_of_the_system(gateway: Session, tmp_path: Path) -> None:

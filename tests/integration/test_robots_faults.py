@@ -103,7 +103,15 @@ async def test_no_robot_of_senders_that_are_no_vehicle(tmp_path: Path) -> None:
         assert code == 0
         assert "drone_7" in printed
         assert set(it.robots()) == {"drone_7"}
+
+        async def beat() -> None:
+            while True:
+                act()
+                await asyncio.sleep(0.3)
+
+        beating = asyncio.create_task(beat())  # a command takes seconds where the machine is busy
         code, printed = await swiftbot(it.fleet, "robots", "forget", "drone_7")
+        beating.cancel()
         assert code != 0
         assert "drone_7 is online" in printed
         await it.until(lambda: not it.robots()["drone_7"].online)

@@ -145,7 +145,13 @@ def _alike(said: Mapping[str, Any], want: Mapping[str, Any], site: Site, catalog
         return False
     if catalogue.skills[said["skill"]].reports and said["skill"] != "say":
         return True
-    return all(_value(said["params"].get(key), value, site) for key, value in want["params"].items() if key != "robots")
+    named = {key: value for key, value in want["params"].items() if key != "robots"}
+    if not named and "return_home" in str(want["skill"]) and "place" in said["params"]:
+        named = {"place": "home"}
+    mine = said["params"]
+    if len(named) == len(mine) == 1 and named.keys() != mine.keys():
+        mine = dict(zip(named, mine.values(), strict=True))  # dock's station is goto's place
+    return all(_value(mine.get(key), value, site) for key, value in named.items())
 
 
 def _value(said: Any, want: Any, site: Site) -> bool:

@@ -20,6 +20,7 @@ MOST_PARTS = 64
 GEOGRAPHIC_DEG = 0.5
 """A pair of numbers as near as this to the site's latitude and longitude is meant as such, where it has decimals."""
 _IN_BRACKETS = re.compile(r"\([^()]*\)")
+_NUMBER = r"[-+−]?\d{1,6}(?:\.\d+)?"
 _PAIR = re.compile(rf"(?:^|[(;>]|\b(?:to|via|at|from|through|then|and)\s)\s*({_NUMBER})\s*,\s*({_NUMBER})(?![\w.])")
 """A pair of figures that a route names as a point."""
 _SPLIT = re.compile(r"[,;]|->|→|\b(?:then|and|via|to|from)\b")

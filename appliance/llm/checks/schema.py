@@ -12,11 +12,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from appliance.llm.checks.places import place_problems
-from appliance.model import Plan, RobotInfo, Site, Subtask
+from appliance.model import MAX_SUBTASKS, SPLIT, Plan, RobotInfo, Site, Subtask, oversize
 from appliance.skills.catalogue import Catalogue, Param, SkillManifest
 
-MAX_SUBTASKS = 64
-"""Longer plans are a model that loops; no instruction of 2,000 characters needs more."""
 MAX_PROBLEMS = 32
 """Problems listed; the rest would help nobody."""
 MAX_TEXT = 500
@@ -49,8 +47,8 @@ def validate(
     """
     if not plan.subtasks:
         return ("the plan is empty: give at least one subtask",)
-    if len(plan.subtasks) > MAX_SUBTASKS:
-        return (f"the plan has {len(plan.subtasks)} subtasks: at most {MAX_SUBTASKS}, give the order in parts",)
+    if problem := oversize(len(plan.subtasks)):
+        return (f"{problem}: {SPLIT}",)
     problems: list[str] = []
     if plan.domain not in catalogue.domains:
         problems.append(f"domain {shown(plan.domain)} is unknown: use one of {', '.join(catalogue.domains)}")

@@ -373,10 +373,11 @@ def time(facts: Facts) -> Iterable[Finding]:
     rest = set(left(facts))
     tokens = facts.reading.tokens
     found: list[int] = []
+    small = lx.FILLERS - {"every", "each"}
     text = facts.reading.text
     for match in (*_CLOCK.finditer(text), *_DELAYED.finditer(text), *_REPEATED.finditer(text)):
         inside = [n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()]
-        if inside and any(index in rest and tokens[index].text not in lx.FILLERS for index in inside):
+        if inside and any(index in rest and tokens[index].text not in small for index in inside):
             found += inside
     free = _free_values(facts)
     for match in _OFTEN.finditer(text):
@@ -620,6 +621,10 @@ def _path(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str
         yield f'the path "{value}" leads nowhere'
     if words := sorted(set(said) & _NOT_IN[name]):
         yield f'"{words[0]}" is no place of a path'
+    if long := next(
+        (each for each in re.split(r"[,;(]|\b(?:then|and|via|to|from)\b", value) if len(each.split()) > 5), ""
+    ):
+        yield f'"{long.strip()}" is no place of a path'
 
 
 def _free_text(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str]:
@@ -633,6 +638,8 @@ def _free_text(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterabl
     if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
         yield "a robot cannot speak to the operator: notify does"
     words = set(re.findall(r"[a-z]+", value.lower()))
+    if name == "event" and re.match(r"(?:there|here|at|in|on)\b", value.lower()):
+        yield f'"{value}" is where something is, and nothing that happens'
     if name == "event" and (words <= _NO_EVENT or set(value.lower().split()[-1:]) & lx.DURATIONS):
         yield f'"{value}" is nothing that happens'
 
@@ -649,7 +656,7 @@ def _name(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str
         yield f'{name} "{value}" is no name'
     if name in _PLACES and (shorter := _known_part(facts, value)):
         yield f'{name} "{value}" is more than {shorter}'
-    elif set(low.split()) & _NOT_IN.get(name, lx.IN_NO_NAME) or "," in value:
+    elif set(low.split()) & _NOT_IN.get(name, lx.IN_NO_NAME) or "," in value or (name in _THINGS and " from " in low):
         yield f'{name} "{value}" is more than a name'
 
 

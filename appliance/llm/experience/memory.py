@@ -16,12 +16,12 @@ import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
-from appliance.llm.experience.outcomes import outcomes, plan_outcome
+from appliance.llm.experience.outcomes import outcomes, plan_outcomes
 from appliance.llm.experience.statistic import Experience, Row
 from appliance.llm.routing.budget import Budget, Spent
 from appliance.llm.routing.cache import Kept, PlanCache
 from appliance.llm.routing.thresholds import Thresholds
-from appliance.model import TaskRecord, TaskState, encode
+from appliance.model import Plan, TaskRecord, TaskState, encode
 
 log = structlog.get_logger(__name__)
 
@@ -139,22 +139,24 @@ class Memory:
             self._write_soon()
 
     def _learn_plan(self, record: TaskRecord) -> None:
-        first = record.plan.provenance if record.plan is not None else None
-        if record.plan is None or first is None:
-            return
-        good = plan_outcome(record)
-        if good is not None:
-            self.thresholds.add(first.tier.value, first.confidence, good=good)
+        for each in plan_outcomes(record):
+            self.thresholds.add(each.origin.tier.value, each.origin.confidence, good=each.good)
             self._changed[_THRESHOLDS] = lambda: encode(self.thresholds.rows())
-        if good:
-            kept = self.cache.succeeded(first.key, record.plan)
-            for gone in self.cache.surplus():
-                self._changed[_PLAN + gone] = lambda: None
-            if kept is not None:
-                self._changed[_PLAN + first.key] = lambda: encode(kept)
-        elif record.state is TaskState.FAILED or good is False:
+            if each.good and record.plan is not None:
+                self._keep_plan(each.origin.key, record.plan)
+            else:
+                self.forget_plan(each.origin.key)
+        first = record.plan.provenance if record.plan is not None else None
+        if record.state is TaskState.FAILED and first is not None:
             # Whatever it failed for: what failed is not done again without a thought.
             self.forget_plan(first.key)
+
+    def _keep_plan(self, key: str, plan: Plan) -> None:
+        kept = self.cache.succeeded(key, plan)
+        for gone in self.cache.surplus():
+            self._changed[_PLAN + gone] = lambda: None
+        if kept is not None:
+            self._changed[_PLAN + key] = lambda: encode(kept)
 
     def forget_plan(self, key: str) -> None:
         """Forget a plan of the cache."""

@@ -6,12 +6,21 @@ nothing of the plan.
 
 from msgspec import Struct
 
-from appliance.model import Failure, RevisionKind, SubtaskRecord, SubtaskState, TaskRecord, TaskState, plan_hash
+from appliance.model import (
+    Failure,
+    Provenance,
+    RevisionKind,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskState,
+    plan_hash,
+)
 
 NOT_ITS_FAULT = frozenset({"unreachable", "refused", "pool", "stopped", "orphaned", "cancelled", "prerequisite"})
 """Codes of failures that are of gateways, containers and people."""
-PLANS_FAULT = frozenset({"plan", "payload", "not-found", "config"})
-"""Codes of failures by which a plan asked for what there is not."""
+PLANS_FAULT = frozenset({"plan", "payload", "not-found", "config", "precondition"})
+"""Codes of failures by which a plan asked for what there is not, or for what cannot be done as things stand."""
 
 
 class Outcome(Struct, frozen=True, kw_only=True):
@@ -49,23 +58,36 @@ def outcomes(record: TaskRecord) -> tuple[Outcome, ...]:
     return tuple(found)
 
 
-def plan_outcome(record: TaskRecord) -> bool | None:
-    """Whether a plan of the decomposer turned out well; None where the record does not say.
+class PlanOutcome(Struct, frozen=True):
+    """Whether a plan of the decomposer turned out well, and where it came from."""
 
-    Good: it succeeded as it was made. Bad: it asked for what there is not, had to be made anew, or an operator turned
-    it down or put another in its place.
+    origin: Provenance
+    good: bool
+
+
+def plan_outcomes(record: TaskRecord) -> tuple[PlanOutcome, ...]:
+    """Return how the decomposer's plans of a task turned out, as far as its record says.
+
+    Bad: an operator turned it down or put another in its place; it asked for what there is not, or had to be made
+    again. Good: it succeeded as it was made.
     """
-    first = record.plan.provenance if record.plan is not None else None
-    if first is None or record.plan is None:
-        return None
+    found: list[PlanOutcome] = []
     decision = record.decision
-    if decision is not None and (not decision.approved or decision.edited):
-        return False
+    if decision is not None and decision.plan is not None and decision.plan.provenance is not None:
+        found.append(PlanOutcome(decision.plan.provenance, good=False))
+    first = record.plan.provenance if record.plan is not None else None
+    # What became of an edited plan says nothing of the plan that it was made of.
+    if first is not None and not first.edited and (good := _ran_well(record, first)) is not None:
+        found.append(PlanOutcome(first, good))
+    return tuple(found)
+
+
+def _ran_well(record: TaskRecord, origin: Provenance) -> bool | None:
     if record.replans or any(each.kind is RevisionKind.PLAN for each in record.revisions):
         return False
-    if record.state is TaskState.SUCCEEDED:
+    if record.state is TaskState.SUCCEEDED and record.plan is not None:
         # A plan that another robot or skill had to help out of was not carried out as it was made.
-        return True if not record.revised and plan_hash(record.plan) == first.hash else None
+        return True if not record.revised and plan_hash(record.plan) == origin.hash else None
     if record.state is TaskState.FAILED:
         codes = {each.failure.code for each in record.subtasks if each.failure is not None}
         codes |= {record.failure.code} if record.failure is not None else set()

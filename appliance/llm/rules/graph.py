@@ -11,9 +11,8 @@ from typing import Any
 from msgspec import Struct, field
 
 from appliance.errors import PlanError
-from appliance.llm.checks.schema import MAX_SUBTASKS
 from appliance.llm.rules.phrases import Step
-from appliance.model import Subtask
+from appliance.model import MAX_SUBTASKS, SPLIT, Subtask
 from appliance.skills.catalogue import Catalogue
 
 
@@ -181,7 +180,8 @@ class Graph:
 
     def _node(self, step: Step, robot: str | None, after: Iterable[int]) -> int:
         if len(self.steps) >= MAX_SUBTASKS:
-            raise PlanError(f"the instruction asks for more than {MAX_SUBTASKS} subtasks", remedy="give it in parts")
+            text = f"the instruction asks for more than {MAX_SUBTASKS} subtasks, which is the most a plan may have"
+            raise PlanError(text, remedy=SPLIT, oversize=True)
         self.steps.append(
             (step.skill, robot, {key: value for key, value in step.params.items() if not key.startswith("_")})
         )

@@ -19,13 +19,13 @@ import time
 import traceback
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from . import usage
 from .context import Context
-from .frames import FrameError, encode
+from .frames import beyond, size_of
 from .limits import address_space, limit_ahead, limit_run
-from .link import CallError, Cancelled, Fail, Frame, Link
+from .link import LARGE, CallError, Cancelled, Fail, Frame, Link
 from .preload import Loaded, explain
 
 MAX_RESULT = 4 * 2**20
@@ -45,7 +45,6 @@ SLOW = "raise timeout_s in its skill.toml, or find out what it waits for"
 FULL = "remove from its volumes what is not needed any more, have it write less, or make room on the disk"
 REMEDIES = {"deadline": SLOW, "disk": FULL}
 TEXTS = {"disk": "it had written much into its volumes, whose disk is nearly full, or beside its runner's socket"}
-LARGE = "put large things with ctx.put_artifact and return the reference"
 BROKEN = "its last lines are in the log: mend its handler"
 
 
@@ -124,15 +123,14 @@ def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - on
             result = {}
         if not isinstance(result, dict):
             return _error("skill", f"{name} returned {type(result).__name__}, not a dict", remedy="return a dict")
-        body = len(encode({"ev": "result", "result": result}))
+        if problem := _unfit(name, cast("Frame", result)):
+            return problem
     except Cancelled:
         return _cancelled(kit, name)
     except CallError as error:
         return _error(error.code, error.message, remedy=error.remedy, retryable=error.retryable)
     except Fail as error:
         return _error("skill", error.message, remedy=error.remedy, retryable=error.retryable)
-    except FrameError as error:
-        return _error("payload", explain(error), remedy=LARGE, trace=_trace(error))
     except MemoryError as error:
         text = f"{name} ran out of its memory ({order.get('memory_mb')} MB and headroom)"
         return _error("memory", text, remedy="raise memory_mb in its skill.toml", retryable=True, trace=_trace(error))
@@ -146,9 +144,21 @@ def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - on
         return _error("skill", explain(error), remedy=remedy, retryable=retryable, trace=_trace(error))
     except BaseException as error:  # noqa: BLE001 - supervision boundary: whatever a handler raises is the run's outcome
         return _error("skill", explain(error), remedy=BROKEN, trace=_trace(error))
-    if body > MAX_RESULT:
-        return _error("payload", f"result of {body} bytes, {MAX_RESULT} allowed", remedy=LARGE)
     return {"ev": "result", "result": result}
+
+
+def _unfit(name: str, result: Frame) -> Frame | None:
+    """Return the error of a result that cannot be sent; None for one that can."""
+    try:
+        size = size_of(result)
+    except (TypeError, ValueError, RecursionError) as error:
+        text = f"the result of {name} cannot be written as JSON: {explain(error)}"
+        return _error(
+            "skill", text, remedy="return dicts with text keys, lists, texts, finite numbers, bool, None, bytes"
+        )
+    if size > MAX_RESULT:
+        return _error("payload", beyond(f"the result of {name}", size, MAX_RESULT), remedy=LARGE)
+    return None
 
 
 def _cancelled(kit: Kit, what: str) -> Frame:

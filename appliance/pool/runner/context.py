@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from .frames import encode
-from .link import CallError, Cancelled, Fail, Frame, Link
+from .frames import beyond, encode, size_of
+from .link import LARGE, CallError, Cancelled, Fail, Frame, Link
 from .spec import Skill, Spec
 
+MAX_ARTIFACT = 11 * 2**20
+"""Longest file in bytes that is kept as an artifact: as base64 it fits into one frame."""
 MAX_NEWS = 2**20
 """Longest partial result in bytes of JSON: it is news for whoever listens."""
 MAX_CHECKPOINT = 2**18
@@ -109,7 +111,10 @@ class Context(Surroundings):
         return str(self._dict(self._link.ask("ask", args)).get("answer", ""))
 
     def put_artifact(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> dict[str, Any]:
-        """Keep a file and return a reference to it, fit for a result. At most 11 MiB."""
+        """Keep a file and return a reference to it, fit for a result; CallError when it is longer than 11 MiB."""
+        if len(data) > MAX_ARTIFACT:
+            text = f"the file {name[:80]!r} has {len(data):,} bytes, at most {MAX_ARTIFACT:,} (11 MiB) are possible"
+            raise CallError("payload", text, "write it into a volume of the skill, or in parts")
         args = {"name": name, "data": bytes(data), "media_type": media_type}
         return self._dict(self._link.ask("put_artifact", args))
 
@@ -154,14 +159,10 @@ class Context(Surroundings):
     def _tell(self, kind: str, key: str, value: dict[str, Any], most: int, **more: int) -> None:
         if not isinstance(value, dict):  # pyright: ignore[reportUnnecessaryIsInstance] - handlers are not checked
             raise CallError("payload", f"a {kind} is a dict, not {type(value).__name__}")
-        data = encode({"ev": kind, key: value, **more})
-        if len(data) > most:
-            raise CallError(
-                "payload",
-                f"{kind} of {len(data)} bytes, {most} allowed",
-                "put large things with ctx.put_artifact and keep the reference",
-            )
-        self._link.send_encoded(data)
+        frame = {"ev": kind, key: value, **more}
+        if (size := size_of(frame)) > most:
+            raise CallError("payload", beyond(f"a {kind}", size, most), LARGE)
+        self._link.send_encoded(encode(frame))
 
     @staticmethod
     def _dict(value: Any) -> dict[str, Any]:

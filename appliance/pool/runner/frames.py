@@ -20,6 +20,14 @@ class FrameError(Exception):
     """The other side sent something that is no frame."""
 
 
+class TooLongError(FrameError):
+    """A frame is longer than MAX_FRAME; `size` is what it has, in bytes."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(f"frame of {size:,} bytes, {MAX_FRAME:,} allowed")
+        self.size = size
+
+
 def _pack(value: Any) -> Any:
     """Turn bytes into their tagged form; `json` calls this for whatever it does not know."""
     if isinstance(value, (bytes, bytearray)):
@@ -44,18 +52,35 @@ def encode(value: dict[str, Any], *, lenient: bool = False) -> bytes:
 
     Raises:
         TypeError, ValueError: it holds something JSON cannot say (a class, NaN, text that is no Unicode).
-        FrameError: it is longer than MAX_FRAME.
+        TooLongError: it is longer than MAX_FRAME.
     """
     text = json.dumps(value, default=_pack, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     body = text.encode(errors="replace" if lenient else "strict")
     if len(body) > MAX_FRAME:
-        raise FrameError(f"frame of {len(body)} bytes, {MAX_FRAME} allowed")
+        raise TooLongError(len(body))
     return len(body).to_bytes(4, "big") + body
 
 
 def parse(body: bytes) -> Any:
     """Return the value of a frame's JSON; ValueError when it is none."""
     return json.loads(body, object_hook=untagged)
+
+
+def size_of(value: dict[str, Any]) -> int:
+    """Return the bytes that an object takes as JSON, however many.
+
+    Raises:
+        TypeError, ValueError, RecursionError: JSON cannot say it.
+    """
+    try:
+        return len(encode(value)) - 4
+    except TooLongError as error:
+        return error.size
+
+
+def beyond(what: str, size: int, most: int) -> str:
+    """Return the sentence for something that is too long, in bytes and MiB."""
+    return f"{what} has {size:,} bytes of JSON, at most {most:,} ({most / 2**20:g} MiB) are possible"
 
 
 class Decoder:
@@ -84,7 +109,7 @@ class Decoder:
             return None
         length = int.from_bytes(self._buffer[:4], "big")
         if length > MAX_FRAME:
-            raise FrameError(f"frame of {length} bytes, {MAX_FRAME} allowed")
+            raise TooLongError(length)
         if len(self._buffer) < 4 + length:
             return None
         body = bytes(self._buffer[4 : 4 + length])

@@ -11,9 +11,11 @@ import threading
 from collections.abc import Callable
 from typing import Any, cast
 
-from .frames import Decoder, FrameError, encode
+from .frames import MAX_FRAME, Decoder, FrameError, TooLongError, beyond, encode
 
 Frame = dict[str, Any]
+LARGE = "write large data into a volume of the skill, or keep it with ctx.put_artifact, and pass on where it is"
+"""The remedy for whatever is too long."""
 
 
 class Fail(Exception):  # noqa: N818 - the word skill writers use: raise ctx.Fail(...)
@@ -42,6 +44,14 @@ class CallError(Fail):
 
 class Cancelled(BaseException):
     """The run is to end now. Not an Exception, so that `except Exception` in a handler does not swallow it."""
+
+
+def _encoded(what: str, frame: Frame, *, lenient: bool = False) -> bytes:
+    """Return a frame's bytes; CallError with `what`, size and limit when it is too long."""
+    try:
+        return encode(frame, lenient=lenient)
+    except TooLongError as error:
+        raise CallError("payload", beyond(f"ctx.{what}", error.size, MAX_FRAME), LARGE) from error
 
 
 class Link:
@@ -91,8 +101,13 @@ class Link:
                 raise Cancelled
 
     def send(self, frame: Frame) -> None:
-        """Send one frame whole, what is no Unicode in it replaced; Cancelled when the gateway is gone."""
-        self.send_encoded(encode(frame, lenient=True))
+        """Send one frame whole, what is no Unicode in it replaced.
+
+        Raises:
+            CallError: it is longer than a frame may be.
+            Cancelled: the gateway is gone.
+        """
+        self.send_encoded(_encoded(str(frame.get("ev")), frame, lenient=True))
 
     def send_encoded(self, data: bytes) -> None:
         """Send one frame that is encoded already."""
@@ -121,7 +136,7 @@ class Link:
         with self._asking:
             self._count += 1
             number = self._count
-            self.send_encoded(encode({"ev": "call", "n": number, "name": name, "args": args}))
+            self.send_encoded(_encoded(name, {"ev": "call", "n": number, "name": name, "args": args}))
             while True:
                 reply = self._receive()
                 if reply.get("n") != number:

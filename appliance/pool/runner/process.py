@@ -150,7 +150,7 @@ class Run:
         reason = child.REASONS.get(self.shared[child.REASON], "")
         remedy = ""
         if reason == "deadline":
-            text = f"did not end within {self.timeout_s:g} s"
+            text = f"did not end within {self.timeout_s:g} s, nor when it was asked to, and was ended by the watchdog"
             remedy = child.SLOW
         elif reason:
             text = f"was ended: {child.TEXTS.get(reason, reason)}"

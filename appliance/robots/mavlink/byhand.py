@@ -27,7 +27,7 @@ class ByHand:
         if not vehicle.armed or (vehicle.flies and not vehicle.airborne):
             what = "is on the ground" if vehicle.flies else "is not armed"
             first = "takeoff" if vehicle.flies else "arm"
-            raise RobotFailure("robot", f"{vehicle.name} {what}", remedy=f"`{first}` first")
+            raise RobotFailure("precondition", f"{vehicle.name} {what}", remedy=f"`{first}` first")
         if vehicle.mode != craft.modes.guided:
             await craft.mode(craft.modes.guided)
         loop = asyncio.get_running_loop()

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.model import Place, Plan, Site, Subtask, Tier
+from appliance.model import Place, Plan, Site, Subtask, Tier, oversize
 from appliance.model.geo import MAX_EXTENT_M, inside, off_height, off_site, to_site
 from appliance.robots.mavlink.dialect import constant, label
 
@@ -48,6 +48,7 @@ UNSUPPORTED_FRAME = constant("MAV_MISSION_UNSUPPORTED_FRAME")
 UNSUPPORTED = constant("MAV_MISSION_UNSUPPORTED")
 INVALID = constant("MAV_MISSION_INVALID")
 DENIED = constant("MAV_MISSION_DENIED")
+NO_SPACE = constant("MAV_MISSION_NO_SPACE")
 _FIRST_PARAM = constant("MAV_MISSION_INVALID_PARAM1")
 """Of param1; those of the other parameters follow."""
 _X, _Y, _Z = (constant(f"MAV_MISSION_INVALID_{name}") for name in ("PARAM5_X", "PARAM6_Y", "PARAM7"))
@@ -208,6 +209,8 @@ def plan_of(items: Sequence[Item], *, robot: str, site: Site, first: int = 0, la
     subtasks = maker.done()
     if not subtasks:
         raise UnfitItem(INVALID, "the mission asks for nothing")
+    if problem := oversize(len(subtasks)):
+        raise UnfitItem(NO_SPACE, f"{problem}: split the mission")
     return Plan(domain="navigation", subtasks=subtasks, tier=Tier.RULES, confidence=1.0)
 
 

@@ -285,7 +285,7 @@ class RequestDesk:
         except SwiftbotError as error:
             passing = isinstance(error, _PASSING)
             asked.result = dialect.TEMPORARILY_REJECTED if passing else dialect.DENIED
-            asked.why = error.message
+            asked.why = str(error)
             self._progress.forget(asked.task)
             self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
             log.warning("task by MAVLink is refused", sender=sender, reason=str(error))

@@ -130,15 +130,15 @@ class World:
             )
         if held is not None:
             raise RobotFailure(
-                "robot", f"{robot} already holds the {held.name}", remedy="place it first, it has one hand"
+                "precondition", f"{robot} already holds the {held.name}", remedy="place it first, it has one hand"
             )
         if thing.holder:
-            raise RobotFailure("robot", f"the {thing.name} is held by {thing.holder}", retryable=True)
+            raise RobotFailure("precondition", f"the {thing.name} is held by {thing.holder}", retryable=True)
         distance = math.hypot(thing.x - pose.x, thing.y - pose.y)
         if distance > REACH_M:
             near = self.nearest_place(thing.x, thing.y)
             raise RobotFailure(
-                "robot",
+                "precondition",
                 f"the {thing.name} is {distance:.1f} m away, the arm reaches {REACH_M:g} m",
                 remedy=f"drive to {near} first" if near else "drive there first",
             )
@@ -152,15 +152,15 @@ class World:
         """Return the held thing and the spot to put it down; RobotFailure says why not."""
         held = self.held_by(robot)
         if held is None:
-            raise RobotFailure("robot", f"{robot} holds nothing", remedy=f"pick the {name[:60]} first")
+            raise RobotFailure("precondition", f"{robot} holds nothing", remedy=f"pick the {name[:60]} first")
         wanted = self.find(name, pose.x, pose.y)
         if words(name) not in words(held.name) and (wanted is None or wanted.name != held.name):
-            raise RobotFailure("robot", f"{robot} holds the {held.name}, not the {name[:60]}")
+            raise RobotFailure("precondition", f"{robot} holds the {held.name}, not the {name[:60]}")
         x, y = self._destination(held, at, pose)
         distance = math.hypot(x - pose.x, y - pose.y)
         if distance > REACH_M:
             raise RobotFailure(
-                "robot",
+                "precondition",
                 f"{at[:60]} is {distance:.1f} m away, the arm reaches {REACH_M:g} m",
                 remedy=f"drive to {at[:60]} first",
             )
@@ -192,7 +192,7 @@ class World:
         if distance > REACH_M:
             near_place = self.nearest_place(thing.x, thing.y)
             raise RobotFailure(
-                "robot",
+                "precondition",
                 f"the {thing.name} is {distance:.1f} m away, the arm reaches {REACH_M:g} m",
                 remedy=f"drive to {near_place} first" if near_place else "drive there first",
             )
@@ -223,7 +223,7 @@ class World:
         person = min(chosen, key=lambda each: near[each.name])
         if near[person.name] > within:
             raise RobotFailure(
-                "robot",
+                "precondition",
                 f"{person.name} is {near[person.name]:.1f} m away, {within:g} m are near enough",
                 remedy=f"drive to {person.at} first",
             )
@@ -233,9 +233,9 @@ class World:
         """Return the held thing and the person it is for; RobotFailure says why not."""
         held = self.held_by(robot)
         if held is None:
-            raise RobotFailure("robot", f"{robot} holds nothing", remedy=f"pick the {name[:60]} first")
+            raise RobotFailure("precondition", f"{robot} holds nothing", remedy=f"pick the {name[:60]} first")
         if words(name) not in words(held.name):
-            raise RobotFailure("robot", f"{robot} holds the {held.name}, not the {name[:60]}")
+            raise RobotFailure("precondition", f"{robot} holds the {held.name}, not the {name[:60]}")
         return held, self.person(to, pose, within=2 * REACH_M)
 
     def give(self, robot: str, thing: Thing, person: Person) -> Thing:

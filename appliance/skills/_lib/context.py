@@ -36,6 +36,10 @@ class Context(Surroundings, Protocol):
     preloaded: Any
     scratch: Path
 
+    def CallError(self, code: str, message: str, remedy: str = "", retryable: bool = False) -> Exception:  # noqa: N802
+        """Make the exception that ends the run with that reason and an error's code, by which its fault is told."""
+        ...
+
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
         """Have the robot do `verb`; files of the answer are bytes in `answer["blobs"][name]`."""
         ...

@@ -70,7 +70,7 @@ def plan_way(ctx: Context, start: paths.Point, goal: Spot, *, flies: bool = Fals
                 raise
             return paths.plan(start, (goal.x, goal.y), forbidden)
     except paths.NoPath as error:
-        raise ctx.Fail(f"cannot reach {goal.name}: {error.message}", error.remedy) from error
+        raise ctx.CallError("precondition", f"cannot reach {goal.name}: {error.message}", error.remedy) from error
 
 
 def go(
@@ -102,7 +102,9 @@ def go(
             waypoints.append({"x": round(x, 3), "y": round(y, 3)} | height)
         way += leg
     if len(waypoints) > MAX_WAYPOINTS:
-        raise ctx.Fail(f"the way has {len(waypoints)} turns, {MAX_WAYPOINTS} are possible", "go in several steps")
+        raise ctx.CallError(
+            "payload", f"the way has {len(waypoints)} turns, {MAX_WAYPOINTS} are possible", "go in several steps"
+        )
     metres = paths.length([here, *way])
     name = goals[-1].name
     ctx.progress(done + 0.1 * share, f"going to {name}: {metres:.1f} m, {len(waypoints)} waypoints")
@@ -119,7 +121,13 @@ def _altitude(ctx: Context, before: State, goals: Sequence[Spot]) -> float | Non
     limit = float(ctx.site.get("altitude_limit_m", 60.0))
     for goal in goals:
         if goal.z > limit:
-            raise ctx.Fail(f"{goal.name} is {goal.z:g} m up, the site allows {limit:g} m", "choose a lower place")
+            raise ctx.CallError(
+                "payload", f"{goal.name} is {goal.z:g} m up, the site allows {limit:g} m", "choose a lower place"
+            )
         if goal.z > AIRBORNE_M and not before.flies:
-            raise ctx.Fail(f"{goal.name} is {goal.z:g} m up and {ctx.robot} does not fly", "send a robot that flies")
+            raise ctx.CallError(
+                "precondition",
+                f"{goal.name} is {goal.z:g} m up and {ctx.robot} does not fly",
+                "send a robot that flies",
+            )
     return min(before.z, limit) if before.flies and before.z > AIRBORNE_M else None

@@ -13,7 +13,7 @@ def text(ctx: Context, name: str, *, default: str | None = None) -> str:
     if value is None and default is not None:
         return default
     if not isinstance(value, str) or not value.strip():
-        raise ctx.Fail(f"parameter {name!r} is missing or empty", f"give {name} as text")
+        raise ctx.CallError("payload", f"parameter {name!r} is missing or empty", f"give {name} as text")
     return " ".join(value.split())[:2000]
 
 
@@ -23,9 +23,11 @@ def number(ctx: Context, name: str, *, default: float, low: float, high: float) 
     if value is None:
         return default
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ctx.Fail(f"{name} is {value!r}, not a number", f"give a number from {low:g} to {high:g}")
+        raise ctx.CallError("payload", f"{name} is {value!r}, not a number", f"give a number from {low:g} to {high:g}")
     if not low <= value <= high:
-        raise ctx.Fail(f"{name} is {value:g}, outside {low:g} to {high:g}", f"give a number from {low:g} to {high:g}")
+        raise ctx.CallError(
+            "payload", f"{name} is {value:g}, outside {low:g} to {high:g}", f"give a number from {low:g} to {high:g}"
+        )
     return float(value)
 
 
@@ -33,7 +35,7 @@ def whole(ctx: Context, name: str, *, default: int, low: int, high: int) -> int:
     """Return a whole-number parameter in `low` to `high`; ctx.Fail otherwise."""
     value = number(ctx, name, default=default, low=low, high=high)
     if value != int(value):
-        raise ctx.Fail(f"{name} is {value:g}, not a whole number", f"give one from {low} to {high}")
+        raise ctx.CallError("payload", f"{name} is {value:g}, not a whole number", f"give one from {low} to {high}")
     return int(value)
 
 

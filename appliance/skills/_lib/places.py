@@ -40,7 +40,7 @@ def resolve(ctx: Context, name: str) -> Spot:
         if wanted == key or wanted in (place.get("aliases") or ()):
             return Spot(key, float(place.get("x", 0.0)), float(place.get("y", 0.0)), float(place.get("z", 0.0)))
     known = ", ".join(sorted(places)) or "none: the site's map is empty"
-    raise ctx.Fail(f"the site has no place {wanted[:80]!r}", f"known places: {known}")
+    raise ctx.CallError("not-found", f"the site has no place {wanted[:80]!r}", f"known places: {known}")
 
 
 def route(ctx: Context, text: str) -> list[Spot]:
@@ -74,7 +74,8 @@ def _check_within(ctx: Context, name: str, x: float, y: float) -> None:
     ys = [float(each.get("y", 0.0)) for each in places] or [0.0]
     inside = min(xs) - _FAR_M <= x <= max(xs) + _FAR_M and min(ys) - _FAR_M <= y <= max(ys) + _FAR_M
     if not (inside and math.isfinite(x) and math.isfinite(y)):
-        raise ctx.Fail(
+        raise ctx.CallError(
+            "payload",
             f"{name.strip()} lies more than {_FAR_M:g} m outside the site",
             f"the site's places span x {min(xs):g} to {max(xs):g}, y {min(ys):g} to {max(ys):g}",
         )

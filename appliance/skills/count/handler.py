@@ -11,8 +11,10 @@ def run(ctx: Context) -> dict[str, Any]:
     target = params.text(ctx, "target")
     want = colours.wanted(target, ctx.site)
     if not want.sure:
-        raise ctx.Fail(
-            f"{target!r} cannot be told from other things: only colours can", "name a colour, such as 'red boxes'"
+        raise ctx.CallError(
+            "payload",
+            f"{target!r} cannot be told from other things: only colours can",
+            "name a colour, such as 'red boxes'",
         )
     rows = {
         identity: _fitting(result, want.colours) for identity, result in ctx.inputs.items() if "detections" in result

@@ -43,11 +43,12 @@ def _video(ctx: Context, source: str) -> pictures.Reference:
         named = [each for each in videos if str(each.get("name", "")).lower() in (wanted, f"{params.slug(wanted)}.mp4")]
         if not named:
             have = ", ".join(str(each.get("name", "")) for each in videos) or "none"
-            raise ctx.Fail(
+            raise ctx.CallError(
+                "not-found",
                 f"there is no video {source!r} among what was handed on ({have})",
                 "record it in a subtask before this one",
             )
         return named[-1]
     if not videos:
-        raise ctx.Fail("no video was handed on", "record one in a subtask before this one")
+        raise ctx.CallError("precondition", "no video was handed on", "record one in a subtask before this one")
     return videos[-1]

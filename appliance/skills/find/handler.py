@@ -17,7 +17,9 @@ def run(ctx: Context) -> dict[str, Any]:
     """Return found, detections, the picture it was seen in, and the points that it looked from."""
     target = params.text(ctx, "target")
     if not colours.wanted(target, ctx.site).sure:
-        raise ctx.Fail(f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'")
+        raise ctx.CallError(
+            "payload", f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'"
+        )
     speed = moves.speed(ctx)
     saved = ctx.resume or {}
     looked = params.rows(saved.get("looked_from"))

@@ -12,6 +12,8 @@ def run(ctx: Context) -> dict[str, Any]:
     text = params.text(ctx, "path")
     spots = route(ctx, text)
     if not spots:
-        raise ctx.Fail(f"there is no place in {text!r}", "name places in order, such as 'goal 1, aisle, dock 3'")
+        raise ctx.CallError(
+            "not-found", f"there is no place in {text!r}", "name places in order, such as 'goal 1, aisle, dock 3'"
+        )
     done = moves.go(ctx, spots, speed_mps=moves.speed(ctx))
     return {"path": [spot.name for spot in spots], "place": spots[-1].name, **done}

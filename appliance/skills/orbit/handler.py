@@ -47,7 +47,9 @@ def _ring(ctx: Context, before: moves.State, centre: Spot, radius: float) -> lis
     for one, other in zip(ring, [*ring[1:], ring[0]], strict=True):
         for wall in walls:
             if wall.cuts((one.x, one.y), (other.x, other.y)):
-                raise ctx.Fail(
-                    f"a circle of {radius:g} m round {centre.name} runs through {wall.name!r}", "choose another radius"
+                raise ctx.CallError(
+                    "payload",
+                    f"a circle of {radius:g} m round {centre.name} runs through {wall.name!r}",
+                    "choose another radius",
                 )
     return ring

@@ -47,7 +47,8 @@ def _round(ctx: Context, name: str) -> list[Spot]:
         areas = [
             str(each.get("name")) for each in (*(ctx.site.get("obstacles") or ()), *(ctx.site.get("forbidden") or ()))
         ]
-        raise ctx.Fail(
+        raise ctx.CallError(
+            "payload",
             f"{name!r} is one point on the map, with no edge to walk",
             f"name two places or more, or one of: {', '.join(areas) or 'no area is mapped'}",
         )

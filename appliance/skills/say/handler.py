@@ -15,7 +15,7 @@ def run(ctx: Context) -> dict[str, Any]:
     to = params.text(ctx, "to", default="")
     words = f"{to}: {text}" if to else text
     if len(words) > MAX_CHARACTERS:
-        raise ctx.Fail(f"{len(words)} characters to say", f"say at most {MAX_CHARACTERS} at once")
+        raise ctx.CallError("payload", f"{len(words)} characters to say", f"say at most {MAX_CHARACTERS} at once")
     ctx.progress(0.1, f"saying {words[:60]}")
     answer = ctx.command("say", timeout_s=120, text=words)
     ctx.progress(1.0, "said")

@@ -17,7 +17,9 @@ def run(ctx: Context) -> dict[str, Any]:
     lasting = params.number(ctx, "duration_s", default=USUAL_S, low=EVERY_S, high=MAX_S)
     every = params.number(ctx, "window_ms", default=EVERY_S * 1000, low=200.0, high=60000.0) / 1000
     if not colours.wanted(target, ctx.site).sure:
-        raise ctx.Fail(f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'")
+        raise ctx.CallError(
+            "payload", f"{target!r} cannot be recognised: only coloured things can", "name a colour, such as 'red box'"
+        )
     begun = time.monotonic()
     track: list[dict[str, Any]] = []
     last: list[dict[str, Any]] = []

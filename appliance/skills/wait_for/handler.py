@@ -19,7 +19,7 @@ def run(ctx: Context) -> dict[str, Any]:
     if (said := _TIME.fullmatch(event.strip().lower())) is not None:
         seconds = float(said[1]) * (60.0 if said[2].startswith("m") else 1.0)
         if seconds > LONGEST_S:
-            raise ctx.Fail(f"{event} is longer than {LONGEST_S:g} s", remedy="split the wait")
+            raise ctx.CallError("payload", f"{event} is longer than {LONGEST_S:g} s", remedy="split the wait")
         return {"event": event, "waited_s": _wait(ctx, seconds), "pose": ctx.command("state").get("pose")}
     ctx.progress(0.1, f"waits for: {event}")
     answer = ctx.ask(f"{ctx.robot or 'A task'} waits for: {event}. Has it happened?", ("yes", "no"), timeout_s=limit_s)

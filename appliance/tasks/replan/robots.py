@@ -13,16 +13,16 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.llm.checks.schema import able
-from appliance.model import Failure, Plan, RobotInfo, Subtask, SubtaskRecord, SubtaskState, TaskRecord
+from appliance.model import MAX_SUBTASKS, Failure, Plan, RobotInfo, Subtask, SubtaskRecord, SubtaskState, TaskRecord
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.replan.order import before, fresh_ids, in_order
 from appliance.tasks.replan.settings import ReplanConfig
 from appliance.tasks.replan.ties import left
-from appliance.tasks.revising import ACTIVE, MAX_SUBTASKS
+from appliance.tasks.revising import ACTIVE
 
 _ANY = re.compile(r"any\d{0,2}")
-_ITS_FAULT = ("robot", "busy", "taken", "contract")
-"""Codes of failures that are a robot's own."""
+_ITS_FAULT = ("robot", "busy", "taken", "contract", "precondition")
+"""Codes of failures that are of one robot: another may have its hand free, or be there already."""
 _ITS_WORD = ("refused", "unreachable", "deadline")
 """Codes that are a robot's when it is offline, or when a handler passed its final refusal on."""
 

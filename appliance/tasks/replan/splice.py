@@ -10,12 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord
+from appliance.model import MAX_SUBTASKS, Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.replan.order import before, fresh_ids, in_order
 from appliance.tasks.replan.robots import robot_of
 from appliance.tasks.replan.ties import left
-from appliance.tasks.revising import ACTIVE, MAX_SUBTASKS
+from appliance.tasks.revising import ACTIVE
 
 
 class Spliced(Struct, frozen=True, kw_only=True):

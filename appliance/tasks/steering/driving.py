@@ -21,6 +21,7 @@ from appliance.tasks.orders import Orders
 from appliance.tasks.pace import Pace
 from appliance.tasks.steering.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
 from appliance.tasks.steering.deciding import may_pause, may_resume, may_retry, needed_robots, proposal_for
+from appliance.tasks.steering.hashing import plan_hash
 from appliance.tasks.surroundings import Input, RunHeld, Steered, Surroundings
 
 log = structlog.get_logger(__name__)
@@ -124,6 +125,8 @@ class Steering:
         proposal = proposal_for(keeper.record, ask)
         if proposal is None:
             return
+        # A plan that is sent back as it was is no other plan.
+        edited = ask.plan if ask.plan is not None and plan_hash(ask.plan) != proposal.hash else None
         if ask.plan is not None and (problems := self._around.plan_problems(keeper.record, ask.plan)):
             raise PlanError(
                 f"the edited plan is not valid, and the task waits on: {'; '.join(problems[:5])}",
@@ -134,9 +137,9 @@ class Steering:
             keeper.transition(
                 TransitionKind.APPROVED,
                 subtask=proposal.subtask,
-                plan=ask.plan,
+                plan=edited,
                 note=ask.by,
-                decision=_decision(ask, proposal.hash, approved=True, edited=ask.plan is not None),
+                decision=_decision(ask, proposal.hash, approved=True, edited=edited is not None),
             )
         )
 
@@ -262,7 +265,7 @@ def _word(ask: RejectAsk | RetryAsk) -> Word:
     return Word(by=ask.by, why=ask.why, act=ask.act, at_ns=time.time_ns())
 
 
-def _decision(ask: ApproveAsk | RejectAsk, plan_hash: str, *, approved: bool, edited: bool = False) -> Decision:
+def _decision(ask: ApproveAsk | RejectAsk, of: str, *, approved: bool, edited: bool = False) -> Decision:
     return Decision(
-        approved=approved, by=ask.by, why=ask.why, hash=plan_hash, edited=edited, act=ask.act, at_ns=time.time_ns()
+        approved=approved, by=ask.by, why=ask.why, hash=of, edited=edited, act=ask.act, at_ns=time.time_ns()
     )

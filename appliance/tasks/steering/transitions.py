@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from appliance.model import (
     Attempt,
+    Decision,
     Plan,
     Proposal,
     SubtaskRecord,
@@ -62,21 +63,31 @@ def proposed(record: TaskRecord, event: Transition) -> TaskRecord:
 def approved(record: TaskRecord, event: Transition) -> TaskRecord:
     """Let a plan that waits take effect, or an edited one in its place."""
     proposal = _waiting(record, event)
-    plan = event.plan or proposal.plan
+    decision = event.decision
+    plan = proposal.plan
+    if event.plan is not None:
+        # Where the plan before came from stays known: what was wrong with it is learned from.
+        before = proposal.plan.provenance
+        origin = replace(before, edited=True) if before is not None else event.plan.provenance
+        plan = replace(event.plan, provenance=origin)
+        decision = _of_plan(decision, proposal)
     if record.state is TaskState.PROPOSED:
-        return replace(begun(record, plan), decision=event.decision)
+        return replace(begun(record, plan), decision=decision)
     changed = replace(proposal, waits=False, plan=plan, hash=plan_hash(plan))
-    return replace(record, proposal=changed, decision=event.decision)
+    return replace(record, proposal=changed, decision=decision)
 
 
 def rejected(record: TaskRecord, event: Transition) -> TaskRecord:
     """Turn a plan down: the task is cancelled, or fails with what the plan was to mend."""
-    _waiting(record, event)
+    decision = _of_plan(event.decision, _waiting(record, event))
     if record.state is TaskState.PROPOSED:
-        return replace(
-            record, state=TaskState.CANCELLED, proposal=None, decision=event.decision, cancelled_by=event.word
-        )
-    return replace(revising.replan_failed(record, event), decision=event.decision)
+        return replace(record, state=TaskState.CANCELLED, proposal=None, decision=decision, cancelled_by=event.word)
+    return replace(revising.replan_failed(record, event), decision=decision)
+
+
+def _of_plan(decision: Decision | None, proposal: Proposal) -> Decision | None:
+    """Have a decision say of which plan it is, and why that plan waited: the proposal goes with it."""
+    return None if decision is None else replace(decision, plan=proposal.plan, note=proposal.note)
 
 
 def paused(record: TaskRecord, event: Transition) -> TaskRecord:

@@ -9,6 +9,7 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance.record.facts import RecorderStatus
+from appliance.record.heard import kinds_text
 from appliance.tui.drawing import clock, counted
 from appliance.tui.safe import safe
 from appliance.tui.store import SILENT, Gateway
@@ -104,14 +105,15 @@ def recorder_notes(recorders: Iterable[RecorderStatus]) -> list[Text]:
     lines: list[Text] = []
     for each in recorders:
         name = f"recorder {safe(each.id, 63)}".removesuffix(" recorder")
-        dropped = sum(each.dropped.values())
-        lost = f", {dropped} lost ({safe(', '.join(sorted(each.dropped)))})" if dropped else ""
+        missed = sum(each.missed.values())
+        lost = f", missed {missed:,} messages of keys {safe(kinds_text(each.missed), 240)}" if missed else ""
         if each.problem:
             remedy = "`swiftbot record` starts it again" if each.state == "failed" else "make room, or see its log"
             lines.append(Text(f"✘ {name}: {safe(each.problem)}{lost} → {remedy}", "red"))
         elif each.state == SILENT:
-            lines.append(Text(f"▲ {name}: not heard any more → is `swiftbot record` running?", "yellow"))
+            lines.append(Text(f"▲ {name}: not heard any more{lost} → is `swiftbot record` running?", "yellow"))
         else:
-            style = "yellow" if dropped else "dim"
-            lines.append(Text(f"✔ {name}: {counted(each.messages, 'message')} in {safe(each.file, 200)}{lost}", style))
+            sign, style = ("▲", "yellow") if missed else ("✔", "dim")
+            told = f"{sign} {name}: {counted(each.messages, 'message')} in {safe(each.file, 200)}{lost}"
+            lines.append(Text(told, style))
     return lines

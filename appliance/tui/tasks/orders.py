@@ -4,8 +4,9 @@ from rich.console import RenderableType
 
 from appliance.client import FleetClient
 from appliance.errors import PayloadError
-from appliance.model import TaskRecord, TaskState
+from appliance.model import TaskRecord
 from appliance.reasons import why_text
+from appliance.steering import cancel_outcome
 from appliance.tasks.migration.api import MigrateAsk
 from appliance.tui.action import Given
 
@@ -22,12 +23,10 @@ def split_subtask(text: str) -> tuple[str, str]:
     return task, subtask
 
 
-async def cancel(fleet: FleetClient, given: Given, _by: str) -> TaskRecord | str:
+async def cancel(fleet: FleetClient, given: Given, _by: str) -> str:
     """Stop a task."""
     record = await fleet.cancel(given["task"], why=given.get("why", ""))
-    # The answer may be older than what it answers: that the task runs is not what the operator should read then.
-    ending = record.state.final or record.state is TaskState.CANCELLING
-    return record if ending else f"task {record.id} is being cancelled"
+    return cancel_outcome(record)
 
 
 async def why(fleet: FleetClient, given: Given, _by: str) -> RenderableType:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from appliance.errors import ConfigError, PlanError, RefusedError, UnreachableError
@@ -117,6 +118,23 @@ async def test_invalid_plan_is_repaired_once_with_the_problems(build: Build) -> 
     previous, problems = local.asked[1]
     assert previous == BAD
     assert "there is no such skill" in problems[0]
+
+
+@pytest.mark.parametrize("last", [True, False])
+async def test_more_subtasks_than_a_plan_may_have_is_the_reason_that_is_told(
+    build: Build, catalogue: Catalogue, last: bool
+) -> None:
+    """By the rules' own bound and by a model's plan that is too long: the limit, and to split the task."""
+    robots = tuple(RobotInfo(id=f"rover_{number}", kind="zenoh", uses=("base",)) for number in range(50))
+    text = "All robots go to dock 1. Then all robots go to dock 2."
+    step = going().subtasks[0]
+    subtasks = tuple(msgspec.structs.replace(step, id=f"s{number}") for number in range(65))
+    model = FakeTier(Tier.LOCAL, sure(msgspec.structs.replace(going(), subtasks=subtasks)), repairs=False)
+    broken = FakeTier(Tier.UPSTREAM, UnreachableError("no server", remedy="start it"))
+    tiers = (broken, RulesTier(catalogue)) if last else (model, broken)
+    with pytest.raises(PlanError, match="64") as refused:
+        await build(*tiers).plan(PlanContext(instruction=text, robots=robots))
+    assert "split it into tasks of at most 64" in refused.value.remedy
 
 
 async def test_plan_that_stays_invalid_escalates(build: Build) -> None:

@@ -103,6 +103,14 @@ def run(ctx):
             ctx.checkpoint({"done": step + 1})
     if do == "large":
         return {"x": "y" * (5 * 2**20)}
+    if do == "vast":
+        return {"x": "y" * (50 * 2**20)}
+    if do == "vast log":
+        ctx.log("hello", data="y" * (17 * 2**20))
+    if do == "vast partial":
+        ctx.partial({"x": "y" * (17 * 2**20)})
+    if do == "vast notice":
+        ctx.notify("a", "y" * (17 * 2**20))
     if do == "huge call":
         ctx.put_artifact("big", b"x" * (17 * 2**20))
     if do == "memory":
@@ -149,14 +157,24 @@ def run(ctx):
 """
 
 
-def write_skill(root: Path, name: str, handler: str, *, image: str = "base") -> None:
-    """Write a skill's folder."""
+PROMISING = "def run(ctx):\n    return ctx.params['result']\n"
+PROMISES = """
+produces = ["number", "findings"]
+
+[results.count]
+type = "integer"
+required = false
+"""
+
+
+def write_skill(root: Path, name: str, handler: str, *, image: str = "base", more: str = "") -> None:
+    """Write a skill's folder; `more` is TOML that its manifest has besides."""
     folder = root / name
     folder.mkdir(parents=True)
     (folder / "handler.py").write_text(textwrap.dedent(handler))
     (folder / "skill.toml").write_text(
         f'id = "{name}"\ndomain = "coordination"\nsummary = "A test."\nruns = "compute"\n'
-        f'image = "{image}"\ncpu = 0.2\nmemory_mb = 64\n'
+        f'image = "{image}"\ncpu = 0.2\nmemory_mb = 64\n{more}\n'
     )
 
 
@@ -175,6 +193,7 @@ def skills_dir(short_dir: Path) -> Path:
     write_skill(root, "probe", HANDLER)
     write_skill(root, "broken", "import no_such_module\ndef run(ctx):\n    return {}\n")
     write_skill(root, "seeing", "def run(ctx):\n    return {'saw': True}\n", image="vision")
+    write_skill(root, "promising", PROMISING, more=PROMISES)
     return root
 
 

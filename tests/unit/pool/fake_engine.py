@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
-from appliance.pool.engine import ContainerSpec, EngineFacts, Found, FoundImage
+from appliance.pool.engine import ContainerSpec, EngineFacts, Exit, Found, FoundImage
 
 
 def environment() -> dict[str, str]:
@@ -45,6 +45,10 @@ class FakeEngine:
     def __init__(self, scratch: Path) -> None:
         self.scratch = scratch
         self.away = False
+        self.silent = False
+        """Whether it stands still: it answers no sign of life."""
+        self.exits: dict[str, Exit] = {}
+        """How containers ended, beside those that were killed."""
         self.refuse = ""
         self.missing: set[str] = set()
         """Images by name that are not there."""
@@ -128,6 +132,21 @@ class FakeEngine:
     async def logs(self, container: str) -> str:
         """Say only whose logs these would be."""
         return f"logs of {container}"
+
+    async def ended(self, container: str) -> Exit | None:
+        """Say how it ended: as `exits` says, else killed; None while its process runs."""
+        self._called("ended")
+        if container in self.processes and self.processes[container].returncode is None:
+            return None
+        return self.exits.get(container, Exit(code=137, oom=False))
+
+    async def ping(self, timeout_s: float) -> None:
+        """Answer at once, unless it is away or stands still."""
+        if self.away or self.silent:
+            raise UnreachableError(f"Podman has not answered within {timeout_s:g} s", remedy="restart it")
+
+    def hang_up(self) -> None:
+        """Do nothing."""
 
     async def containers(self, labels: Mapping[str, str]) -> list[Found]:
         """Return those with the labels."""

@@ -3,6 +3,7 @@
 import asyncio
 import json
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -11,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Need, Phase, RunEvent, RunEventKind, RunRequest
-from appliance.pool.container import Connection
-from appliance.pool.conversation import Call, Conversation
+from appliance.pool.container import LOST, Connection, Ending
+from appliance.pool.conversation import MOST_CALLS, Call, Conversation
+from appliance.pool.runner.frames import MAX_FRAME
 
 KINDS = ("started", "progress", "log", "alive", "partial", "checkpoint", "call", "result", "error")
 NAMES = (
@@ -55,11 +57,20 @@ class Listener:
         """Never full."""
 
 
-async def converse(bodies: list[bytes]) -> tuple[RunEvent, list[RunEvent]]:
+async def lost() -> Ending:
+    """Nobody knows how the container ended."""
+    return LOST
+
+
+async def converse(
+    bodies: list[bytes], refused: Counter[str] | None = None, raw: Sequence[bytes] = ()
+) -> tuple[RunEvent, list[RunEvent]]:
     """Have a run say this; returns its last event and those before."""
     reader = asyncio.StreamReader()
     for body in bodies:
         reader.feed_data(len(body).to_bytes(4, "big") + body)
+    for piece in raw:
+        reader.feed_data(piece)
     reader.feed_eof()
     events: list[RunEvent] = []
 
@@ -75,7 +86,8 @@ async def converse(bodies: list[bytes]) -> tuple[RunEvent, list[RunEvent]]:
         entered_ns=ENTERED_NS,
         on_event=events.append,
         on_call=answer,
-        refused=Counter(),
+        refused=refused if refused is not None else Counter(),
+        ending=lost,
     )
     return await conversation.listen(), events
 
@@ -87,6 +99,92 @@ def test_whatever_a_handler_says_its_run_has_one_end(frames: list[dict[str, Any]
     assert final.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED)
     for event in (*events, final):
         assert msgspec.json.decode(msgspec.json.encode(event), type=RunEvent).kind is event.kind
+
+
+@given(st.lists(FRAMES, max_size=4))
+def test_whatever_is_left_out_is_counted_and_told(frames: list[dict[str, Any]]) -> None:
+    """News and results of a wrong type, unknown events: none is lost without a count, and each failure says what."""
+    refused: Counter[str] = Counter()
+    final, events = asyncio.run(converse([json.dumps(each).encode() for each in frames], refused))
+    assert final.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED)
+    if final.failure is not None:
+        assert final.failure.code
+        assert final.failure.message
+    heard = []  # what was read: all up to the frame that ended the run
+    for each in frames:
+        heard.append(each)
+        if each["ev"] in ("result", "error") or each["ev"] not in KINDS:
+            break
+    broken = "runner frame" in refused
+    if not broken:
+        wrong = sum(each["ev"] == "partial" and not is_table(each, "result") for each in heard)
+        wrong += sum(
+            each["ev"] == "checkpoint" and not (is_table(each, "data") and is_count(each.get("calls", 0)))
+            for each in heard
+        )
+        wrong += sum(each["ev"] == "progress" and not is_number(each.get("fraction", 0.0)) for each in heard)
+        bare = sum(
+            each["ev"] == "log" and each.get("fields") is not None and not is_table(each, "fields") for each in heard
+        )
+        assert refused["run news"] == wrong + bare
+        assert sum("was left out" in event.note for event in events) >= wrong
+        results = [each for each in heard if each["ev"] == "result"]
+        assert refused["result"] == sum(not is_table(each, "result") for each in results)
+        if results:
+            assert (final.kind is RunEventKind.SUCCEEDED) == is_table(results[0], "result")
+
+
+def is_table(frame: dict[str, Any], key: str) -> bool:
+    """Whether a frame has a table there; one that stands for bytes is none."""
+    value = frame.get(key)
+    return isinstance(value, dict) and not (len(value) == 1 and isinstance(value.get("$b64"), str))
+
+
+def is_count(value: Any) -> bool:
+    """Whether it can be a number of calls."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MOST_CALLS
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> tuple[bytes, bool]:
+    """Return bytes as a runner may send them, and whether they are whole frames of JSON objects to the end."""
+    parts: list[bytes] = []
+    whole = True
+    for _ in range(draw(st.integers(0, 4))):
+        kind = draw(st.sampled_from(["news", "news", "bytes", "list", "long", "cut"]))
+        body = json.dumps({"ev": "progress", "fraction": 0.5}).encode()
+        if kind == "bytes":
+            body = draw(st.binary(min_size=1, max_size=30))
+        elif kind == "list":
+            body = json.dumps([body.decode()]).encode()
+        length = len(body)
+        if kind == "long":
+            length = draw(st.integers(MAX_FRAME + 1, 2**32 - 1))
+        elif kind == "cut":
+            length += draw(st.integers(1, 2**20))
+        whole = whole and kind == "news"
+        parts.append(length.to_bytes(4, "big") + body)
+        if not whole:
+            break
+    return b"".join(parts), whole
+
+
+@given(streams(), st.integers(1, 64))
+def test_bytes_that_are_no_frames_end_the_run_with_one_counted_error(stream: tuple[bytes, bool], step: int) -> None:
+    """Malformed, cut off or longer than any frame, in pieces of any size: counted once, with a reason and a remedy."""
+    data, whole = stream
+    refused: Counter[str] = Counter()
+    final, _ = asyncio.run(converse([], refused, raw=[data[at : at + step] for at in range(0, len(data), step)]))
+    assert final.kind is RunEventKind.FAILED
+    assert final.failure is not None
+    assert final.failure.message
+    assert final.failure.remedy
+    assert (final.failure.code, refused["runner frame"]) == (("pool", 0) if whole else ("payload", 1))
 
 
 @pytest.mark.parametrize("at", [0, -1, 1e300, 10**400, "x", None, True])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.errors import UnreachableError
 from appliance.pool import engine
 from appliance.pool.engine import Engine, EngineFacts, PodmanEngine
 from appliance.pool.link import EngineLink
@@ -59,5 +60,42 @@ async def test_what_is_missing_at_the_start_may_come(short_dir: Path, monkeypatc
     assert connected == ["4.3.1"]
     assert link.there()[1].rootless
     await link.close()
+    server.close()
+    await server.wait_closed()
+
+
+async def test_a_podman_that_stands_still_and_one_that_hangs_up_give_no_sign_of_life(short_dir: Path) -> None:
+    """Each is told with its reason and remedy; one that answers again is heard over a connection that is kept."""
+    asked: list[int] = []
+    still = False
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked.append(0)
+        try:
+            while (await reader.readuntil(b"\r\n\r\n")).startswith(b"HEAD /_ping ") and not still:
+                asked[-1] += 1
+                writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n")
+            await reader.read()
+        except (asyncio.IncompleteReadError, ConnectionError):
+            pass
+        finally:
+            writer.close()
+
+    socket = short_dir / "p.sock"
+    podman = PodmanEngine(f"unix://{socket}")
+    with pytest.raises(UnreachableError, match="is not there"):
+        await podman.ping(5.0)
+    server = await asyncio.start_unix_server(serve, socket)
+    for _ in range(3):
+        await podman.ping(60.0)
+    assert asked == [3], "three signs of life over one connection"
+    still = True
+    with pytest.raises(UnreachableError, match=r"has not answered within 0.05 s at its API socket") as silent:
+        await podman.ping(0.05)
+    assert "restart podman.service" in silent.value.remedy
+    still = False
+    await podman.ping(60.0)
+    podman.hang_up()
+    podman.close()
     server.close()
     await server.wait_closed()

@@ -1,6 +1,7 @@
 """The pool's books, with real runners but no Podman: who gets which container, and how runs end."""
 
 import asyncio
+import signal
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,9 @@ import pytest
 
 from appliance.errors import ConfigError, NotFoundError, PayloadError, PoolError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need, Phase, RunEventKind
+from appliance.pool import link as link_module
+from appliance.pool import running as running_module
+from appliance.pool.engine import Exit
 from appliance.pool.runner.zygote import MAX_CONNECTIONS
 from appliance.pool.selection import Candidate
 from tests.unit.pool.bench import COLD
@@ -216,6 +220,40 @@ async def test_bad_runs_end_with_one_failure(bench: Any, do: str, code: str) -> 
     assert final.kind is RunEventKind.SUCCEEDED
 
 
+@pytest.mark.parametrize(
+    ("result", "told"),
+    [
+        (None, "output 'number' is missing: expected a number, got a result with nothing in it"),
+        ({"findings": []}, "output 'number' is missing: expected a number, got a result with 'findings'"),
+        ({"number": None, "findings": 1}, "output 'number' is missing: expected a number, got null"),
+        ({"number": "3", "findings": 1}, "output 'number' has the wrong type: expected a number, got the text '3'"),
+        ({"number": True, "findings": 1}, "expected a number, got true"),
+        ({"number": 3}, "output 'findings' is missing: expected a value"),
+        ({"number": 3, "findings": 1, "count": 1.5}, "output 'count' has the wrong type: expected a whole number"),
+    ],
+)
+async def test_a_result_that_is_not_what_the_manifest_promises_fails_its_run(
+    bench: Any, result: Any, told: str
+) -> None:
+    """It names skill, output, what is expected and what came; it is counted, and not tried again."""
+    pool = await bench.pool()
+    final, _ = await bench.run(pool, bench.request(1, skill="promising", result=result))
+    assert final.kind is RunEventKind.FAILED
+    assert (final.failure.code, final.failure.retryable) == ("payload", False)
+    assert final.failure.message.startswith("the result of promising is not what its manifest promises: ")
+    assert told in final.failure.message
+    assert "skill.toml" in final.failure.remedy
+    assert pool.refused["result"] == 1
+
+
+@pytest.mark.parametrize("more", [{}, {"count": 3}, {"count": 3.0}, {"count": None}, {"other": "x"}])
+async def test_a_result_may_hold_more_than_its_manifest_promises(bench: Any, more: dict[str, Any]) -> None:
+    """What is promised is there, what is optional may be left out, and nothing else is looked at."""
+    result = {"number": 2.5, "findings": ["x"], **more}
+    final, _ = await bench.run(await bench.pool(), bench.request(1, skill="promising", result=result))
+    assert (final.kind, final.result) == (RunEventKind.SUCCEEDED, result)
+
+
 async def test_cancel(bench: Any, tmp_path: Path) -> None:
     """A run can be cancelled while it runs and while it waits; one that is not there is not."""
     pool = await bench.pool(capacity=1)
@@ -301,3 +339,76 @@ async def test_the_same_run_twice(bench: Any, tmp_path: Path) -> None:
         await pool.run(bench.request(1), COLD, lambda _: None)
     await pool.cancel("t/s1/1")
     await task
+
+
+@pytest.mark.parametrize(
+    ("exit_", "code", "told"),
+    [
+        (Exit(code=137, oom=True), "memory", "ran out of memory and was killed by the kernel"),
+        (Exit(code=137, oom=False), "pool", "was killed by SIGKILL in mid-run"),
+        (Exit(code=3, oom=False), "pool", "exited with code 3 in mid-run"),
+        (None, "pool", "Podman does not say why"),
+    ],
+)
+async def test_a_container_that_ends_in_mid_run_says_how(
+    bench: Any, tmp_path: Path, exit_: Exit | None, code: str, told: str
+) -> None:
+    """By what Podman knows of its process 1; with Podman away it is told as lost, and nothing waits for Podman."""
+    pool = await bench.pool(reconnect_s=600.0)
+    running = asyncio.create_task(bench.run(pool, bench.request(1, do="sleep", pid=str(tmp_path / "pid"))))
+    await bench.until((tmp_path / "pid").exists, "the run")
+    (victim,) = (name for name in bench.engine.processes if bench.engine.specs[name].labels)
+    if exit_ is None:
+        bench.engine.away = True
+        await bench.until(lambda: pool.problem, "Podman is missed")
+    else:
+        bench.engine.exits[victim] = exit_
+    await bench.engine.kill(victim)
+    final, _ = await running
+    assert (final.failure.code, final.failure.retryable) == (code, True)
+    assert told in final.failure.message
+    assert final.failure.remedy
+
+
+async def test_a_runner_that_stands_still_is_told_as_hung(bench: Any, tmp_path: Path) -> None:
+    """Its probes find it out before the run's deadline: the failure says how long it gave no answer."""
+    pool = await bench.pool(probe_s=0.05, probe_timeout_s=0.1, probe_failures=2)
+    request = bench.request(1, do="sleep", pid=str(tmp_path / "pid"), deadline_s=60.0)
+    running = asyncio.create_task(bench.run(pool, request))
+    await bench.until((tmp_path / "pid").exists, "the run")
+    for process in bench.engine.processes.values():
+        process.send_signal(signal.SIGSTOP)
+    final, _ = await running
+    assert (final.failure.code, final.failure.retryable) == ("hung", True)
+    assert "did not answer for 0.2 s (2 probes in a row); the watchdog ended it" in final.failure.message
+
+
+async def test_a_run_that_its_runner_does_not_end_is_ended_by_the_watchdog(
+    bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without probes the pool's own bound ends it, and says for how long the handler did not answer."""
+    monkeypatch.setattr(running_module, "BACKSTOP_S", 0.2)
+    pool = await bench.pool(probe_s=600.0, cancel_grace_s=0.1)
+    request = bench.request(1, do="sleep", pid=str(tmp_path / "pid"), deadline_s=1.7)
+    running = asyncio.create_task(bench.run(pool, request))
+    await bench.until((tmp_path / "pid").exists, "the run")
+    for process in bench.engine.processes.values():
+        process.send_signal(signal.SIGSTOP)
+    final, _ = await running
+    assert (final.failure.code, final.failure.retryable) == ("deadline", True)
+    assert "did not answer for 2 s" in final.failure.message
+    assert "watchdog" in final.failure.message
+
+
+async def test_a_podman_that_stands_still_is_a_problem_until_it_answers(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is asked of it meanwhile: the watch finds it, whoever shows the pool is told, and it goes by itself."""
+    monkeypatch.setattr(link_module, "WATCH_S", 0.02)
+    pool = await bench.pool()
+    assert not pool.problem
+    bench.engine.silent = True
+    await bench.until(lambda: "has not answered within" in pool.problem, "the problem")
+    assert "restart it" in pool.problem
+    bench.engine.silent = False
+    await bench.until(lambda: not pool.problem, "it is gone")

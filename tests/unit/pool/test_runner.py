@@ -126,8 +126,12 @@ async def test_call_round_trip(zygote: Zygote) -> None:
         ("segv", "crashed", "killed by SIGSEGV", True),
         ("exit", "crashed", "ended by itself with status 3", True),
         ("sys.exit", "skill", "SystemExit: 4", False),
-        ("large", "payload", "allowed", False),
-        ("huge call", "payload", "allowed", False),
+        ("large", "payload", "at most 4,194,304 (4 MiB)", False),
+        ("vast", "payload", "52,428,808 bytes of JSON, at most 4,194,304 (4 MiB)", False),
+        ("vast log", "payload", "ctx.log has 17,8", False),
+        ("vast partial", "payload", "at most 1,048,576 (1 MiB)", False),
+        ("vast notice", "payload", "ctx.notify has 17,8", False),
+        ("huge call", "payload", "at most 11,534,336 (11 MiB)", False),
         ("memory", "memory", "ran out of its memory", True),
         ("list", "skill", "returned list, not a dict", False),
         ("class", "skill", "object cannot be sent", False),
@@ -141,6 +145,8 @@ async def test_bad_handlers(zygote: Zygote, do: str, code: str, text: str, retry
     assert [frame["ev"] for frame in frames].count("error") == 1
     assert (error["ev"], error["code"], error["retryable"]) == ("error", code, retryable)
     assert text in error["message"]
+    if code == "payload":
+        assert "volume" in error["remedy"], "where large data goes instead"
     if do in ("raise", "memory"):
         assert any("handler.py" in line for line in error["trace"])
     assert (await _run(zygote, "echo"))[-1]["ev"] == "result"

@@ -276,9 +276,19 @@ def test_drops_are_written_down(tmp_path: Path) -> None:
     writer.tick()
     writer.close()
     assert _gaps(writer.files) == [
-        Gap(reason="queue full", dropped=4, payload_bytes=15, since_ns=2000, until_ns=3000, last_key="k2")
+        Gap(
+            reason="queue full",
+            dropped=4,
+            payload_bytes=15,
+            since_ns=2000,
+            until_ns=3000,
+            last_key="k2",
+            keys={"k1": 3, "k2": 1},
+        )
     ]
-    assert info(writer.files[0]).dropped == 4
+    told = info(writer.files[0])
+    assert (told.dropped, told.missed) == (4, {"k1": 3, "k2": 1})
+    assert writer.missed == {"k1": 3, "k2": 1}
     assert writer.dropped == {"queue full": 4}
 
 

@@ -158,6 +158,17 @@ async def test_what_a_mission_means() -> None:
     assert [each.after for each in plan.subtasks] == [(), *((each.id,) for each in plan.subtasks[:-1])]
 
 
+async def test_a_mission_of_more_subtasks_than_a_plan_may_have_is_refused_at_its_upload(store: FakeStore) -> None:
+    """Not when it is started: the ground station is told the limit and to split it, and nothing is held."""
+    ground = Ground(store)
+    turns = [item(TURNS, 12, 12, 8, 2.0, 0.0, 5.0) for _ in range(65)]
+    assert await ground.upload([MISSION[0], *turns]) == NO_SPACE
+    told = "".join(ground.texts)
+    assert "at most 64" in told
+    assert "split the mission" in told
+    assert not store.values
+
+
 @pytest.mark.parametrize(
     ("bad", "result", "told"),
     [
@@ -230,7 +241,7 @@ async def test_what_would_not_run_is_refused_with_the_reason_of_its_plan(store: 
     ground.desk = MissionDesk(
         RobotsConfig(), site=SITE, store=store, refused=ground.refused, clock=lambda: ground.now, problems=problems
     )
-    assert await ground.upload([item(WAYPOINT, 1 + number % 30, 4, 8.0, 1.0) for number in range(40)]) == DENIED
+    assert await ground.upload([item(WAYPOINT, 1 + number % 30, 4, 8.0, 1.0) for number in range(40)]) == NO_SPACE
     assert "at most 64" in "".join(ground.texts)
     assert not store.values
 

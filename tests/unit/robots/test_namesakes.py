@@ -125,3 +125,16 @@ async def test_what_needs_no_counting(verb: str, doubtful: bool) -> None:
         cast("Any", session), "cart_1", RobotCommand(id="x", verb=verb), timeout_s=5.0, doubtful=doubtful
     )
     assert (reply.failure, session.asked, len(session.queries)) == (None, [], 1)
+
+
+def test_since_when_a_robot_is_lost_is_known_until_it_is_back(fleet: Fleet) -> None:
+    """Once, from the first news that it is offline, whatever is said of it afterwards."""
+    fleet.put(OLD, "drive")
+    assert not fleet.roster.lost_ns
+    fleet.put(OLD, "", online=False)
+    since = dict(fleet.roster.lost_ns)
+    assert list(since) == ["cart_1"]
+    fleet.put(OLD, "again", online=False)
+    assert fleet.roster.lost_ns == since
+    fleet.put(OLD, "drive")
+    assert not fleet.roster.lost_ns

@@ -25,6 +25,14 @@ class Fail(Exception):  # noqa: N818 - the runner's name for it
         self.message, self.remedy, self.retryable = message, remedy, retryable
 
 
+class CallError(Fail):
+    """Stands in for the runner's `ctx.CallError`."""
+
+    def __init__(self, code: str, message: str, remedy: str = "", retryable: bool = False) -> None:
+        super().__init__(message, remedy, retryable)
+        self.code = code
+
+
 class Moved(BaseException):
     """A run is left where it is: its next attempt is made elsewhere."""
 
@@ -33,6 +41,7 @@ class FakeContext:
     """A `ctx` whose robot goes where it is sent at once and photographs what the test has drawn."""
 
     Fail = Fail
+    CallError = CallError
 
     def __init__(self, scratch: Path, **params: Any) -> None:
         self.params: dict[str, Any] = params

@@ -153,6 +153,9 @@ def test_an_extra_folder_adds_a_skill(tmp_path: Path) -> None:
         ("required = false", 'required = "no"', "params.to.required: "),
         ("[params.to]", "[params.To]", "params.To: "),
         ("[params.to]", "[params.to", "cannot be read"),
+        ("[params.to]", '[results.count]\ntype = "many"\n[params.to]', "results.count.type: "),
+        ("[params.to]", "[results.count]\nrequired = true\n[params.to]", "results.count.type: missing"),
+        ("[params.to]", '[results.Count]\ntype = "number"\n[params.to]', "results.Count: "),
     ],
 )
 def test_a_wrong_manifest_names_file_and_key(tmp_path: Path, old: str, new: str, key: str) -> None:

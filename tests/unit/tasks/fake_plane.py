@@ -186,6 +186,7 @@ class FakeRegistry:
         self.robots: dict[str, Any] = {}
         self.on_change: list[Callable[[str], None]] = []
         self.ages: dict[str, float] = {}
+        self.lost_ns: dict[str, int] = {}
 
     def age_s(self, gateway: str) -> float:
         """Return what the test says; by default nothing was ever heard."""

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError, RobotError
-from appliance.model import Failure, Need, Notice, RobotCommand, RobotReply, RunRequest, encode
+from appliance.model import Failure, Need, Notice, RobotCommand, RobotInfo, RobotReply, RunRequest, encode
 from appliance.pool.pool import Call
 from appliance.tasks import calls as module
 from appliance.tasks.artifacts import Artifacts
@@ -230,3 +230,29 @@ async def test_a_command_that_a_stop_has_ended_is_no_failure_of_the_handler(
     assert not command.done()
     command.cancel()
     await asyncio.gather(command, return_exceptions=True)
+
+
+async def test_a_robot_that_is_lost_during_its_command_is_waited_for_with_the_reason(
+    calls: Calls, plane: Any, waits: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run's note says for which robot it waits, since when and what it holds; and that it is back."""
+    monkeypatch.setattr(module, "LOST_LOOK_S", 0.01)
+    answer = asyncio.Event()
+
+    async def sent(*_: Any, **__: Any) -> RobotReply:
+        await answer.wait()
+        return RobotReply(id="t-1/s1/1", result={"at": "dock"})
+
+    monkeypatch.setattr(module, "send_command", sent)
+    robot = RobotInfo(id="r1", kind="zenoh", holding="red box")
+    plane.registry.robots["r1"] = robot
+    running = asyncio.create_task(calls(ask("command", verb="goto", args={})))
+    for info, told in ((replace(robot, online=False), 1), (robot, 2)):
+        plane.registry.robots["r1"] = info
+        plane.registry.lost_ns = {} if info.online else {"r1": 1_700_000_000_000_000_000}
+        async with asyncio.timeout(60):
+            while len(waits) < told:
+                await asyncio.sleep(0.001)
+    assert waits == ["waits for robot r1, lost since 22:13:20 UTC, while it held the red box", "r1 is back"]
+    answer.set()
+    assert await running == {"at": "dock"}

@@ -121,6 +121,20 @@ async def test_a_stop_is_no_task(manager: TaskManager, plane: Any, text: str, su
     assert not plane.dht.records
 
 
+@pytest.mark.parametrize("verb", ["submit", "accept"])
+async def test_a_plan_that_is_too_long_is_refused_before_it_is_a_task(
+    manager: TaskManager, plane: Any, verb: str
+) -> None:
+    """Whoever hands it in, with the limit and what to do about it: no task is made of it that would fail later."""
+    step = plane.plan_of().subtasks[0]
+    subtasks = tuple(replace(step, id=f"s{number}", after=()) for number in range(65))
+    request = TaskRequest(instruction="work", id="t-1", plan=Plan(domain="navigation", subtasks=subtasks))
+    with pytest.raises(PayloadError, match="65 subtasks, at most 64") as refused:
+        await getattr(manager, verb)(request)
+    assert "split it" in refused.value.remedy
+    assert not plane.dht.records
+
+
 async def test_an_undriven_task_is_taken_up_without_a_ring_change(
     manager: TaskManager, plane: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -372,3 +386,13 @@ async def test_whoever_has_a_run_is_held_until_its_task_has_ended(manager: TaskM
     plane.session.put(plane.keys.run("t-1", "s1"), encode(event))
     await until(lambda: manager.unfinished == 0)
     assert plane.held == {}
+
+
+async def test_a_cancel_answers_with_the_state_that_came_of_it(manager: TaskManager, plane: Any) -> None:
+    """Not with the one before it: as it is written, in the record that others read as well."""
+    await manager.submit(wish(plane))
+    await until(lambda: manager._drivers["t-1"].record.subtasks)
+    answer = await manager.cancel(CancelTaskAsk(id="t-1", by="ann", why="enough"))
+    assert answer.state is TaskState.CANCELLED
+    assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
+    assert (await manager.cancel(CancelTaskAsk(id="t-1"))).cancelled_by == answer.cancelled_by, "asked again: the same"

@@ -2,6 +2,7 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, Subtask, SubtaskRecord
 from appliance.tasks.placement import bind, place
@@ -189,3 +190,8 @@ def test_a_bound_robot_that_went_offline_is_waited_for() -> None:
     chosen, why = bind("any", records, robots={"rover_1": away}, uses={}, verbs={}, busy=frozenset())
     assert chosen is None
     assert why == "waits for rover_1: offline"
+    holding = replace(away, holding="red box")
+    at_ns = 1_700_000_000_000_000_000
+    for roster, held in (({"rover_1": holding}, ", while it held the red box"), ({"rover_1": away}, ""), ({}, "")):
+        _, why = bind("any", records, robots=roster, uses={}, verbs={}, busy=frozenset(), lost_ns={"rover_1": at_ns})
+        assert why == f"waits for robot rover_1, lost since 22:13:20 UTC{held}", "also when its row has gone"

@@ -61,9 +61,14 @@ async def test_robots_are_shown_at_80_by_24(view: "FakeView") -> None:
             "✔ recorder r: 7 messages in",
         ),
         (
-            RecorderStatus(id="r", fleet="t", state="paused", problem="the disk is full", dropped={"disk full": 3}),
-            "✘ recorder r: the disk is full, 3 lost (disk full)",
+            RecorderStatus(id="r", fleet="t", state="paused", problem="the disk is full", missed={"gw/*/log": 3}),
+            "✘ recorder r: the disk is full, missed 3 messages of keys gw/*/log 3",
         ),
+        (
+            RecorderStatus(id="r", fleet="t", state="recording", missed={"gw/*/log": 3, "robot/*/mavlink/*": 1500}),
+            "missed 1,503 messages of keys robot/*/mavlink/*",
+        ),
+        (RecorderStatus(id="r", fleet="t", state="recording", missed={"gw/*/log": 3}), "▲ log misses 3"),
         (RecorderStatus(id="r", fleet="t", state="silent"), "▲ recorder r: not heard any more"),
     ],
 )

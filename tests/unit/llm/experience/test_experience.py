@@ -8,12 +8,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.llm.experience.memory import Memory
-from appliance.llm.experience.outcomes import Outcome, outcomes, plan_outcome
+from appliance.llm.experience.outcomes import Outcome, PlanOutcome, outcomes, plan_outcomes
 from appliance.llm.experience.statistic import Experience
 from appliance.llm.routing.budget import Budget
 from appliance.llm.routing.thresholds import Thresholds
 from appliance.model import (
     Attempt,
+    Decision,
     Failure,
     Plan,
     Provenance,
@@ -127,7 +128,50 @@ def test_only_what_is_their_own_fault_counts() -> None:
 )
 def test_what_a_record_says_of_its_plan(record: TaskRecord, said: bool | None) -> None:
     """Success as it was made is good, asking for what there is not is bad; a broken robot says nothing of the plan."""
-    assert plan_outcome(record) is said
+    assert [each.good for each in plan_outcomes(record)] == ([] if said is None else [said])
+
+
+def judged(task: str, *, approved: bool) -> TaskRecord:
+    """Return the last record of a task whose plan an operator rejected, or replaced by one that then succeeded."""
+    before = plan()
+    decision = Decision(approved=approved, by="ann", edited=approved, plan=before, note="confidence 0.7")
+    if not approved:
+        return TaskRecord(id=task, instruction="pick the box", state=TaskState.CANCELLED, decision=decision)
+    origin = replace(before.provenance, edited=True) if before.provenance is not None else None
+    edited = replace(before, subtasks=(replace(STEP, params={"object": "bag"}),), provenance=origin)
+    return replace(ended(task, made=edited), decision=decision)
+
+
+def test_a_plan_that_an_operator_rejects_or_edits_is_a_bad_one() -> None:
+    """The decision has the plan that they turned down or changed; what an edited one comes to says nothing of it."""
+    for approved in (False, True):
+        (found,) = plan_outcomes(judged("t-1", approved=approved))
+        assert found == PlanOutcome(plan().provenance, good=False)  # pyright: ignore[reportArgumentType]
+    # A rejected plan after a failure says nothing of the first one, which is judged by itself.
+    later = plan(key="k2", confidence=0.65)
+    record = replace(ended(good=False, failures=(NO_PLACE,)), decision=Decision(approved=False, by="ann", plan=later))
+    assert [each.origin.key for each in plan_outcomes(record)] == ["k2", "k"]
+
+
+def test_rejections_and_edits_raise_the_threshold_until_they_are_forgotten() -> None:
+    """Two rejections and an edit of plans that were sure enough: the next one has to be surer, for a shift."""
+    clock = Clock()
+    mind = memory(clock)
+    before = mind.thresholds.of("local")
+    for number, approved in enumerate((False, False, True)):
+        mind.learn(judged(f"t-{number}", approved=approved))
+    assert before < 0.7 < mind.thresholds.of("local")
+    clock.now += 48 * 3600
+    assert mind.thresholds.of("local") == before
+
+
+def test_an_order_that_cannot_be_as_things_stand_is_not_the_robots_fault() -> None:
+    """By the code of the error and not its text: the plan asked for it, the robot said so."""
+    far = Failure(code="precondition", message="the box is 29.0 m away, the arm reaches 1.5 m")
+    record = ended(good=False, failures=(far,))
+    assert outcomes(record) == ()
+    assert [each.good for each in plan_outcomes(record)] == [False]
+    assert [each.good for each in outcomes(ended(good=False, failures=(replace(far, code="robot"),)))] == [False]
 
 
 # --- the statistic --------------------------------------------------------------------------------------------------

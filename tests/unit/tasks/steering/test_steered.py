@@ -10,12 +10,14 @@ from msgspec.structs import replace
 from appliance.errors import ConflictError, NotFoundError, PlanError, RefusedError, SwiftbotError
 from appliance.model import (
     Failure,
+    Provenance,
     RunEventKind,
     SoftStop,
     Subtask,
     SubtaskState,
     TaskRecord,
     TaskState,
+    Tier,
     encode,
 )
 from appliance.tasks import machine
@@ -101,8 +103,33 @@ async def test_an_edited_plan_is_checked_before_it_is_taken(bench: Any) -> None:
     await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
     _, request = await bench.ordered()
     assert request.params == {"n": 2}
-    assert bench.driver.record.decision.edited
+    ran = bench.driver.record
+    assert ran.decision.edited
+    assert (ran.decision.plan, ran.decision.note) == (record.proposal.plan, record.proposal.note)
     assert same(fold(bench), bench.driver.told)
+
+
+async def test_an_edited_plan_keeps_where_the_one_before_came_from(bench: Any) -> None:
+    """Its provenance says that it was edited; one that is sent back as it was is no edit."""
+    origin = Provenance(tier=Tier.LOCAL, confidence=0.7, key="k")
+    bench.around.the_plan = replace(bench.around.the_plan, provenance=origin)
+    record = await proposed(bench)
+    edited = bench.plan_of(Subtask(id="s1", skill="work", params={"n": 2}))
+    await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
+    await bench.ordered()
+    ran = bench.driver.record
+    assert ran.plan.provenance == replace(origin, edited=True)
+    assert ran.decision.plan.provenance == origin
+    assert same(fold(bench), bench.driver.told)
+
+
+async def test_a_plan_that_is_sent_back_as_it_was_is_approved_and_not_edited(bench: Any) -> None:
+    """An editor that was closed without a change: the record has one plan, approved."""
+    record = await proposed(bench)
+    await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=record.proposal.plan, by="ann"))
+    await bench.ordered()
+    ran = bench.driver.record
+    assert (ran.decision.edited, ran.decision.plan) == (False, None)
 
 
 async def test_an_approval_is_bound_to_the_hash(bench: Any) -> None:
@@ -122,6 +149,7 @@ async def test_a_plan_that_is_turned_down_cancels_its_task(bench: Any) -> None:
     ended = await bench.end()
     assert ended.state is TaskState.CANCELLED
     assert (ended.cancelled_by.by, ended.cancelled_by.why) == ("ann", "the dock is closed")
+    assert (ended.decision.plan, ended.decision.note) == (bench.around.the_plan, "every plan is approved first")
     assert same(fold(bench), ended)
 
 
