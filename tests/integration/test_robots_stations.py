@@ -150,6 +150,7 @@ async def field(free_ports: Ports, tmp_path: Path) -> AsyncIterator[Field]:
 
 
 async def end_processes(processes: list[asyncio.subprocess.Process]) -> None:
+    """End processes that a test started."""
     for process in processes:
         if process.returncode is None:
             process.kill()

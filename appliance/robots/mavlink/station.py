@@ -258,7 +258,7 @@ class Station:
             self._early[index, frame.system] += 1
             return None
         same = self._vehicles.get(name)
-        if same is not None and not same.vehicle.online and same.vehicle.system == frame.system:
+        if same is not None and self._may_be_back(same, entry, frame):
             return self._take_back(same, index)
         if same is not None or name in self._others:
             self._count("name_conflict")
@@ -271,6 +271,13 @@ class Station:
         self._names.clear()
         self._by_source[index, frame.system] = each
         return each
+
+    def _may_be_back(self, each: _Attached, entry: OpenLink, frame: Frame) -> bool:
+        """Whether a silent vehicle may be followed to another link: not from a signed one to one without a key."""
+        if each.vehicle.online or each.vehicle.system != frame.system:
+            return False
+        old = self.links.get(each.end.link)
+        return entry.link.codec.signer is not None or old is None or old.link.codec.signer is None
 
     def _take_back(self, each: _Attached, link: int) -> _Attached:
         """Know a vehicle by another link, which it is heard on while it is silent on the one that it was known by."""
