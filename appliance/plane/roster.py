@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterable
 import msgspec
 from msgspec.structs import replace
 
+from appliance.errors import PayloadError
 from appliance.model import RobotInfo
 from appliance.model.plausible import plausible, read_robot
+from appliance.plane.keys import check_name
 from appliance.plane.session import Closer, Message, Session
 
 ROBOT_KEPT_S = 300.0
@@ -52,7 +54,7 @@ class Roster:
     def take(self, robots: Iterable[RobotInfo]) -> None:
         """Learn of robots from a gateway that knows them; what they said themselves is newer."""
         for robot in robots:
-            if robot.id not in self.robots and len(self.robots) < MOST_ROBOTS:
+            if robot.id not in self.robots and len(self.robots) < MOST_ROBOTS and self._named(robot.id):
                 self.robots[robot.id] = self._believed(robot)
                 if not robot.online:
                     self._went(robot.id)
@@ -74,6 +76,15 @@ class Roster:
         if dropped:
             self._session.refuse("implausible robot/*/state", robot=info.id, left_out=", ".join(dropped))
         return believed
+
+    def _named(self, robot: str) -> bool:
+        """Whether it is a name that a robot may have: `*` on a key would be all of them, and so would its commands."""
+        try:
+            check_name(robot, "robot")
+        except PayloadError as error:
+            self._session.refuse("misnamed robot/*/state", reason=error.message)
+            return False
+        return True
 
     def doubtful(self, robot: str) -> bool:
         """Whether more than one may carry out what this robot is ordered: they have to be counted first."""
@@ -114,6 +125,8 @@ class Roster:
             return
         if info.id != robot:
             self._session.refuse("misplaced robot/*/state", key=key, says=info.id)
+            return
+        if not self._named(robot):
             return
         if robot not in self.robots and len(self.robots) >= MOST_ROBOTS:
             self._session.refuse("too many robot/*/state", key=key)

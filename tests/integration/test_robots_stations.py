@@ -145,11 +145,12 @@ async def field(free_ports: Ports, tmp_path: Path) -> AsyncIterator[Field]:
         hub = RobotHub(config, session=session, store=store, gateway="gw-1", site=SITE, tasks=tasks)
         await hub.start()
         stack.push_async_callback(hub.stop)
-        stack.push_async_callback(_end, field.processes)
+        stack.push_async_callback(end_processes, field.processes)
         yield field
 
 
-async def _end(processes: list[asyncio.subprocess.Process]) -> None:
+async def end_processes(processes: list[asyncio.subprocess.Process]) -> None:
+    """End processes that a test started."""
     for process in processes:
         if process.returncode is None:
             process.kill()

@@ -180,6 +180,10 @@ class Router:
             self._turns[sender] = turn + 1
         return False
 
+    def unsee(self, raw: bytes) -> None:
+        """Forget that these bytes came: where they came from they were not taken, and a copy by another way may be."""
+        self._seen.pop(raw, None)
+
     def hear(self, passage: Routed, source: End, now: float) -> None:
         """Learn that a sender is at an end."""
         sender = (passage.system, passage.component)

@@ -170,12 +170,17 @@ class Station:
             elif is_autopilot(frame):
                 self._turned_away.add(sender)
             if each is None:
-                self._switch.record(source, "", "rx", frame.raw)
+                self._turn_away(frame, source)
                 return
         if source != each.end:
+            if not is_autopilot(frame) and frame.component != each.vehicle.component:
+                # A camera, a companion computer or a station with its system id and an address of its own.
+                self._switch.record(source, "", "rx", frame.raw)
+                self._switch.hand_on(entry, frame, source, None, now)
+                return
             if each.vehicle.online:
                 self._count("address_conflict")
-                self._switch.record(source, "", "rx", frame.raw)
+                self._turn_away(frame, source)
                 return
             each.end = source  # restarted, or back over another way
             self._names.clear()
@@ -185,6 +190,11 @@ class Station:
         self._switch.record(source, vehicle.name, "rx", frame.raw)
         self._see(each, now)
         self._switch.hand_on(entry, frame, source, vehicle, now)
+
+    def _turn_away(self, frame: Frame, source: End) -> None:
+        """Record a frame that is not taken. A copy of it may come by the way that its sender is known by."""
+        self._switch.router.unsee(frame.raw)
+        self._switch.record(source, "", "rx", frame.raw)
 
     def _vehicles_of(self, system: int) -> list[Vehicle]:
         return [each.vehicle for each in self._vehicles.values() if each.vehicle.system == system]
@@ -247,7 +257,10 @@ class Station:
             self._count("unknown_system")
             self._early[index, frame.system] += 1
             return None
-        if name in self._vehicles or name in self._others:
+        same = self._vehicles.get(name)
+        if same is not None and self._may_be_back(same, entry, frame):
+            return self._take_back(same, index)
+        if same is not None or name in self._others:
             self._count("name_conflict")
             log.warning("vehicle refused: its name is taken", robot=name, system=frame.system)
             return None
@@ -257,6 +270,21 @@ class Station:
         each = self._attach(name, source)
         self._names.clear()
         self._by_source[index, frame.system] = each
+        return each
+
+    def _may_be_back(self, each: _Attached, entry: OpenLink, frame: Frame) -> bool:
+        """Whether a silent vehicle may be followed to another link: not from a signed one to one without a key."""
+        if each.vehicle.online or each.vehicle.system != frame.system:
+            return False
+        old = self.links.get(each.end.link)
+        return entry.link.codec.signer is not None or old is None or old.link.codec.signer is None
+
+    def _take_back(self, each: _Attached, link: int) -> _Attached:
+        """Know a vehicle by another link, which it is heard on while it is silent on the one that it was known by."""
+        for key in [key for key, other in self._by_source.items() if other is each]:
+            del self._by_source[key]
+        self._by_source[link, each.vehicle.system] = each
+        log.info("vehicle is back over another link", robot=each.vehicle.name, link=link)
         return each
 
     def _attach(self, name: str, source: End) -> _Attached:

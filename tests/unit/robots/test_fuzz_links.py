@@ -171,7 +171,13 @@ def _storm(chance: random.Random, count: int) -> list[tuple[bytes, tuple[str, in
                 lambda: make("TIMESYNC", tc1=chance.choice((0, 5)), ts1=chance.getrandbits(60)),
                 lambda: make("COMMAND_LONG", command=31010, confirmation=chance.randint(0, 2), **target, **params),
                 lambda: make("COMMAND_CANCEL", command=31010, **target),
-                lambda: make("MISSION_COUNT", count=chance.randint(0, 300), mission_type=0, **target),
+                lambda: make(
+                    "MISSION_COUNT",
+                    count=chance.randint(0, 300),
+                    mission_type=0,
+                    target_component=191,
+                    target_system=chance.randint(1, 60),
+                ),
                 lambda: make("STATUSTEXT", severity=6, text=b"x" * 50, id=chance.randint(1, 9999), chunk_seq=3),
                 lambda: make("MISSION_CURRENT", seq=chance.randint(0, 9999)),
             )

@@ -109,6 +109,34 @@ async def test_two_vehicles_with_one_system_id() -> None:
         assert made.attached == ("drone_1",)
 
 
+@pytest.mark.parametrize(("signed", "followed"), [(False, True), (True, False)], ids=["unsigned", "signed"])
+async def test_a_silent_vehicle_is_followed_to_another_link(signed: bool, followed: bool, tmp_path: Any) -> None:
+    """But not from a link with a key to one without: whoever jams the first would have its name."""
+    key = tmp_path / "key"
+    key.write_text("hex:" + KEY.hex())
+    key.chmod(0o600)
+    port, other = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
+    link = MavlinkLink(listen=f"udp://127.0.0.1:{other}", signing=str(key) if signed else "")
+    async with (
+        station(port, link, heartbeat_lost_s=0.5) as (made, refused),
+        sender(other) as radio,
+        sender(port) as wifi,
+    ):
+        codec = Codec(1, 1, signer=Signer(KEY, link_id=1) if signed else None)
+        plain = Codec(1, 1)
+        plain._mav.seq = 100
+        await until(lambda: made.online("drone_1"), lambda: radio(codec.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: not made.online("drone_1"))
+        beat = lambda: wifi(plain.pack(make("HEARTBEAT", **BEAT)))  # noqa: E731 - said twice
+        if followed:
+            await until(lambda: made.online("drone_1"), beat)
+            assert "name_conflict" not in refused
+        else:
+            await until(lambda: refused.get("name_conflict", 0) > 3, beat)
+            assert not made.online("drone_1")
+            await until(lambda: made.online("drone_1"), lambda: radio(codec.pack(make("HEARTBEAT", **BEAT))))
+
+
 async def test_an_end_that_understands_mavlink_1_alone() -> None:
     """It is a vehicle like others: what it is told, by the gateway or from another link, is in MAVLink 1."""
     port, other = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
