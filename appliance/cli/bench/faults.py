@@ -37,11 +37,12 @@ def chaos(
     """Tasks with counted effects on gateways that are killed, stopped and started again: is anything lost or doubled?
 
     With `--faults partition` the gateways are cut into two halves for 5, 20 and 60 s, and operators on both sides
-    approve, cancel and submit tasks meanwhile: afterwards every gateway has to answer the same for every task within 1 s.
+    approve, cancel and submit tasks meanwhile: afterwards every gateway has to answer the same for every task within
+    1 s.
 
     Ends with 1 when a task that was accepted did not end, an effect is missing or there twice, gateways answer
-    differently after a partition, or an order was lost without a notice; then the folder with the MCAP log and the ledger
-    is kept and named.
+    differently after a partition, or an order was lost without a notice; then the folder with the MCAP log and the
+    ledger is kept and named.
 
     Args:
         minutes: How long gateways go down; with faults of the network their times count.

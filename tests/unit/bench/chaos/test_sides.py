@@ -1,5 +1,6 @@
 """Orders on both sides of a partition: the same for the same seed, and what became of them, counted rightly."""
 
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -43,7 +44,7 @@ def test_a_partition_comes_several_times_between_the_same_sides(fault_s: float, 
     assert [each.until_s - each.at_s for each in cuts] == lengths
     assert len({each.sides for each in cuts}) == 1
     assert len(found) == len(FAULTS) - 1 + len(lengths)
-    assert all(later.at_s == earlier.until_s + 1.0 for earlier, later in zip(found, found[1:], strict=False))
+    assert all(later.at_s == earlier.until_s + 1.0 for earlier, later in pairwise(found))
 
 
 def test_gateways_agree_when_the_last_difference_that_stayed_is_gone() -> None:
