@@ -21,8 +21,7 @@ from appliance.plane.membership import Membership
 from appliance.plane.namesake import displaced
 from appliance.plane.outlived import Outlived
 from appliance.plane.pulse import Pulse
-from appliance.plane.quorum.forgetting import Forgetting
-from appliance.plane.quorum.voting import Voting
+from appliance.plane.quorum import Leases
 from appliance.plane.reconcile import Reconciler
 from appliance.plane.registry import Registry
 from appliance.plane.ring import Ring
@@ -87,8 +86,7 @@ class Plane:
                 sees=self._sees,
                 renew=session.renew_links,
             )
-        self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
-        self._forgetting = Forgetting(self._voting, gateway=gateway, store=store, kept_hours=config.tombstone_hours)
+        self.leases = Leases(config, gateway=gateway, store=store, rpc=self.rpc)
         self.dht = Dht(
             config,
             gateway=gateway,
@@ -96,9 +94,8 @@ class Plane:
             rpc=self.rpc,
             membership=self._membership,
             pulse=self._pulse,
-            voting=self._voting,
         )
-        Browsing(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, dht=self.dht)
+        Browsing(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self._reconciler = Reconciler(
             config,
             gateway=gateway,
@@ -189,7 +186,7 @@ class Plane:
 
     async def _join(self) -> None:
         membership = self._membership
-        await self._voting.voter.start(lost=self.store.set_aside is not None)
+        await self.leases.start(lost=self.store.set_aside is not None)
         if self.config.connect or set(self.config.peers) - {self.gateway}:
             await self._first_link()
         self._reached("linked")
@@ -215,8 +212,6 @@ class Plane:
         membership.join()
         self._reached("joined")
         self._reconciler.start()
-        if self.gateway in self.config.voters:
-            self._forgetting.start()
         log.info("joined", gateway=self.gateway, members=sorted(membership.members))
         self._unseen = asyncio.get_running_loop().call_later(UNSEEN_S, self._tell_unseen)
 
@@ -326,7 +321,6 @@ class Plane:
         await self._membership.leave()
         self._membership.close()
         await self._reconciler.close()
-        await self._forgetting.close()
         await self.dht.close()
         await self.registry.close()
         self.rpc.close()

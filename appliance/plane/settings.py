@@ -33,7 +33,7 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     virtual_nodes: int = 32
     """Points of each gateway on the ring: shares within about 20 % of each other, and still cheap to compute."""
     voters: tuple[str, ...] = ()
-    """Gateways that vote on reads and writes with a quorum, the same list everywhere; empty: nobody may ask for one.
+    """Gateways that grant leases by majority, the same list everywhere; empty: there are no leases.
     Named and not learned: two parts of a fleet that do not see each other must agree on what a majority is."""
     view: Literal["full"] | int = "full"
     """`full`: every gateway knows every other, a lookup is one hop; right to about 1,000. A number: each knows so many

@@ -60,25 +60,11 @@ class Store:
         """Keep a value; on the disk when this returns, unless not `durable`."""
         await self._execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", key, value, durable=durable)
 
-    async def alter(self, key: str, change: Callable[[bytes | None], bytes | None]) -> None:
-        """Read a value and put what `change` makes of it, with nothing in between; None: leave it.
-
-        `change` runs on the store's thread, and again if the commit it was part of fails.
-        """
-
-        def run(db: sqlite3.Connection) -> None:
-            row = db.execute("SELECT value FROM kept WHERE key = ?", (key,)).fetchone()
-            changed = change(row[0] if row else None)
-            if changed is not None:
-                db.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, changed))
-
-        await self._call(run, writes=True)
-
-    async def delete(self, key: str, *, only: bytes | None = None) -> bool:
-        """Forget a key, if it is there and (`only`) has just that value; returns whether it was forgotten."""
-        where, values = ("", (key,)) if only is None else (" AND value = ?", (key, only))
-        sql = f"DELETE FROM kept WHERE key = ?{where}"  # noqa: S608 - one of two texts of ours
-        return await self._call(lambda db: db.execute(sql, values).rowcount > 0, writes=True)
+    async def delete(self, key: str) -> bool:
+        """Forget a key; returns whether it was there."""
+        return await self._call(
+            lambda db: db.execute("DELETE FROM kept WHERE key = ?", (key,)).rowcount > 0, writes=True
+        )
 
     async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
         """Return (key, value) of every key with that prefix, in order."""

@@ -195,12 +195,13 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
     foreign = await Session.open(PlaneConfig(mode="client", connect=(fleet.endpoints[0],)), "f")
     verbs = sorted(plane.rpc._registered)
     impossible = {
-        "quorum_accept": [{"key": "", "ballot": [1, "a"], "record": {"key": ""}, "voters": ""}],
-        "quorum_prepare": [{"key": "", "ballot": [1, "a"], "voters": ""}],
-        "quorum_settle": [{"key": ""}],
-        "quorum_vote": [{"key": "", "voters": ""}],
-        "quorum_write": [{"key": "", "value": ""}, {"key": "k", "value": "&"}],
-        "record_read": [{"key": ""}, {"key": "", "quorum": True}],
+        "lease_grant": [
+            {"key": "k", "holder": "", "fence": 1, "ttl_s": 1, "voters": ""},
+            {"key": "k", "holder": "h", "fence": 0, "ttl_s": 1, "voters": ""},
+            {"key": "k", "holder": "h", "fence": 1, "ttl_s": 31, "voters": ""},
+        ],
+        "lease_release": [{"key": "k", "holder": "h", "fence": 0, "voters": ""}],
+        "record_read": [{"key": ""}],
         "record_write": [{"key": "", "value": ""}, {"key": "k", "expected": {"g": 0}}],
         "dht_read": [{"key": ""}],
         "dht_write": [{"key": "", "value": ""}, {"key": "k", "expected": {"g": 0}}, {"key": "k", "value": "&"}],
