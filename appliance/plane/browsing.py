@@ -95,7 +95,7 @@ class Browsing:
         return RecordList(tuple(listed), more=len(keys) > asked.limit)
 
     async def _on_place(self, asked: KeyAsk) -> RecordPlace:
-        holders = await self._membership.holders(check_key(asked.key), self._config.replicas)
+        holders = self._membership.ring.successors(check_key(asked.key), self._config.replicas)
         copies = await asyncio.gather(*(self._copy(each, asked) for each in holders))
         return RecordPlace(key=asked.key, owner=holders[0], replicas=holders, copies=tuple(copies))
 

@@ -77,7 +77,7 @@ class Dht:
             gateway=gateway, membership=membership, pulse=pulse, replicas=config.replicas,
             virtual_nodes=config.virtual_nodes,
         )  # fmt: skip
-        self.absence = Absence(replicas=config.replicas, whole=config.view == "full")
+        self.absence = Absence(replicas=config.replicas)
         self._pushing = Pushing(config, gateway=gateway, store=store, rpc=rpc, membership=membership, keep=self.keep)
         self.ordering = Ordering(
             config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
@@ -122,7 +122,7 @@ class Dht:
             What was found, and whether that may be about to change: the owner says that the key is another's, or is not
             there or about to go, of which the membership will tell.
         """
-        holders = list(await self._membership.holders(key, self._config.replicas))
+        holders = list(self._membership.ring.successors(key, self._config.replicas))
         owner, problems, apart = holders[0], dict[str, str](), False
         if replica:
             random.shuffle(holders)
@@ -184,7 +184,7 @@ class Dht:
         until = loop.time() + self._config.write_timeout_s
         while True:
             try:
-                (owner,) = await self._membership.holders(asked.key, 1)
+                owner = self._membership.ring.owner(asked.key)
                 if owner == self._gateway:
                     return (await self.ordering.own(asked)).version
                 answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
@@ -222,12 +222,12 @@ class Dht:
         return Found(record) if record is not None else await self._on_read(KeyAsk(key))
 
     def _read_at_once(self, asked: KeyAsk, answer: AtOnce) -> bool:
-        """Answer a read on Zenoh's thread, where the ring is known whole and the record is in memory.
+        """Answer a read on Zenoh's thread, where the record is in memory.
 
         Whether there is none is for the event loop to say: it knows who was not heard.
         """
         key = check_key(asked.key)
-        if self._config.view != "full" or (self._membership.owns(key) and not self.settling.mine(key)):
+        if self._membership.owns(key) and not self.settling.mine(key):
             return False
         _, record = self._store.look(key)
         if record is not None:

@@ -204,7 +204,7 @@ class FastPath:
 
     def _order(self, asked: Write, answer: AtOnce) -> Copies | None:
         key = asked.key
-        if self._closed or self._config.view != "full" or len(asked.value) > _MOST_VALUE:
+        if self._closed or len(asked.value) > _MOST_VALUE:
             return None
         if key in self._unsaved or len(self._under_way) >= _MOST or not self._settling.mine(key):
             return None
@@ -259,7 +259,7 @@ class FastPath:
     def ring_changed(self) -> None:
         """Others may hold copies from now on: the ways to them are made before the first write wants them."""
         members = self._membership.members
-        if self._config.mode != "peer" or self._config.view != "full" or len(members) > _MOST_READY:
+        if self._config.mode != "peer" or len(members) > _MOST_READY:
             return
         waits, self._readying = self._readying is not None, sorted(members - {self._gateway})
         if not waits:

@@ -66,9 +66,6 @@ class Membership:
         """Whether a gateway counts as there for its questions about records."""
         return name in self._members
 
-    def hold(self, who: str, names: frozenset[str]) -> None:
-        """Stay aware of these while they are there, for `who`; none: no more. Nothing to do where all are known."""
-
     def seen_since(self, moment: float) -> frozenset[str]:
         """The other members whose token was there at a moment of the pulse's clock and has never gone since."""
         return frozenset(name for name, at in self._since.items() if at <= moment)
@@ -80,16 +77,6 @@ class Membership:
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
         return self.ring.owner(key) == self._gateway
-
-    async def holders(self, key: str, n: int) -> tuple[str, ...]:
-        """The first `n` gateways from the key's position on, its owner first; UnreachableError when there is none."""
-        return self.ring.successors(key, n)
-
-    async def enter(self) -> None:
-        """Find one's place among the members; nothing to do where all are known."""
-
-    async def leave(self) -> None:
-        """Tell the neighbours that one goes; nothing to do where all see the token go."""
 
     def start(self) -> None:
         """Begin to watch."""

@@ -93,7 +93,7 @@ class Settling:
         return self._membership.ring.members <= self._ring.members
 
     async def until_met(self) -> None:
-        """Wait a moment until it has: where members of a bounded view come and go, somebody always has just come."""
+        """Wait a moment until it has: in a large fleet somebody always has just come."""
         self.on_wanted()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(RETURNED_S), self._changed:

@@ -4,7 +4,7 @@ import inspect
 import re
 from pathlib import Path
 
-from appliance.plane import bounded, browsing, comparing, dht, ordering, registry
+from appliance.plane import browsing, comparing, dht, ordering, registry
 from appliance.plane.keys import Keys
 from appliance.plane.quorum import leases
 from appliance.plane.settings import PlaneConfig
@@ -28,10 +28,10 @@ def test_every_verb_of_the_plane_is_described(project_root: Path) -> None:
     text = (project_root / "docs" / "keyspace.md").read_text()
     verbs = {
         verb
-        for module in (bounded, browsing, comparing, dht, leases, ordering, registry)
+        for module in (browsing, comparing, dht, leases, ordering, registry)
         for verb in re.findall(r'register\("(\w+)"', inspect.getsource(module))
     }
-    assert len(verbs) == 15
+    assert len(verbs) == 12
     assert all(f"| `{verb}` |" in text for verb in verbs)
 
 
