@@ -23,7 +23,7 @@ from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, Sto
 from appliance.plane.ordering import Ordering
 from appliance.plane.pulse import Pulse
 from appliance.plane.pushing import Pushing
-from appliance.plane.rpc import AtOnce, Rpc
+from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.settling import Settling
 from appliance.plane.store import Store
@@ -83,9 +83,8 @@ class Dht:
             config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
             pushing=self._pushing, keep=self.keep,
         )  # fmt: skip
-        self.on_ring_change.append(self.ordering.fast.ring_changed)
-        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, direct=True, at_once=self._read_at_once)
-        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, direct=True, at_once=self._store_at_once)
+        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False)
+        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False)
         rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
         rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
 
@@ -186,7 +185,7 @@ class Dht:
             try:
                 owner = self._membership.ring.owner(asked.key)
                 if owner == self._gateway:
-                    return (await self.ordering.own(asked)).version
+                    return (await self.ordering.order(asked)).version
                 answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 # Dead, not yet known to be; or of another mind about who owns the key: both pass.
@@ -221,33 +220,6 @@ class Dht:
         record = await self._store.record(key)
         return Found(record) if record is not None else await self._on_read(KeyAsk(key))
 
-    def _read_at_once(self, asked: KeyAsk, answer: AtOnce) -> bool:
-        """Answer a read on Zenoh's thread, where the record is in memory.
-
-        Whether there is none is for the event loop to say: it knows who was not heard.
-        """
-        key = check_key(asked.key)
-        if self._membership.owns(key) and not self.settling.mine(key):
-            return False
-        _, record = self._store.look(key)
-        if record is not None:
-            answer(Found(record))
-        return record is not None
-
-    def _store_at_once(self, asked: StoreAsk, answer: AtOnce) -> bool:
-        """Have the store's thread keep a record and answer, without a turn of the event loop."""
-        record = check_record(asked.record, max_bytes=self._config.max_record_bytes)
-
-        def done(kept: Record | None, error: Exception | None) -> None:
-            if error is not None:
-                answer(error if isinstance(error, SwiftbotError) else SwiftbotError(f"not stored: {error}"))
-            else:
-                answer(Found(None if kept == record else kept))
-
-        order = partial(_settle, record, self.resolver or by_bytes)
-        self._store.change_then(record.key, order, done, durable=asked.durable)
-        return True
-
     async def _on_store(self, asked: StoreAsk) -> Found:
         check_record(asked.record, max_bytes=self._config.max_record_bytes)
         kept = await self.keep(asked.record)
@@ -275,7 +247,6 @@ class Dht:
 
     async def close(self) -> None:
         """Give up what is still being written and pushed."""
-        await self.ordering.fast.close()
         await self._pushing.close()
 
 

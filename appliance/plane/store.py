@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from appliance.plane.ahead import NOTHING, Mark
 from appliance.plane.commits import Call, Commits
 from appliance.plane.rows import read_digests, read_kept, read_records, read_row
 from appliance.plane.versions import Record, digest
@@ -29,7 +28,6 @@ class Store:
         self._loop = loop
         self._opened: asyncio.Future[None] = loop.create_future()
         self._commits = Commits(path, partial(self._post, self._opened, None))
-        self.wake = self._commits.wake
 
     @classmethod
     async def open(cls, path: Path) -> "Store":
@@ -72,10 +70,6 @@ class Store:
 
     # --- records ----------------------------------------------------------------------------------------------
 
-    def look(self, key: str) -> tuple[bool, Record | None]:
-        """Whether a record is known without asking the disk, and it; from any thread."""
-        return self._commits.picture.look(key)
-
     async def record(self, key: str) -> Record | None:
         """Return a record, a tombstone too."""
         known, record = self._commits.picture.look(key)
@@ -105,9 +99,7 @@ class Store:
         Returns what it returned; nothing is written when that is None or what is stored already.
         """
         future: asyncio.Future[Record | None] = self._loop.create_future()
-        self._commits.submit(
-            _change_call(partial(self._change, key, decide), partial(self._post, future), key, durable)
-        )
+        self._commits.submit(_change_call(partial(self._change, key, decide), partial(self._post, future), durable))
         return await future
 
     def change_soon(
@@ -115,9 +107,7 @@ class Store:
     ) -> tuple[asyncio.Future[Record | None], asyncio.Future[Record | None]]:
         """Do the same; returns what was decided, as soon as it is, and the same once it is committed.
 
-        The decision is made here and now where the record's present state is known in memory and nothing is queued that
-        may change it; otherwise on the store's thread in its turn. The two fail alike; when only the second does, the
-        decision was made and the disk did not take it.
+        The two fail alike; when only the second does, the decision was made and the disk did not take it.
         """
         decided: asyncio.Future[Record | None] = self._loop.create_future()
         committed: asyncio.Future[Record | None] = self._loop.create_future()
@@ -128,98 +118,14 @@ class Store:
             self._post(decided, record, error)
             self._post(committed, record, error)
 
-        with self._commits.lock:
-            if self._decide_now(key, decide, decided, committed, durable=durable):
-                return decided, committed
-
         def run(db: sqlite3.Connection) -> Record | None:
             record = self._change(key, decide, db)
             self._post(decided, record, None)
             return record
 
-        self._commits.submit(_change_call(run, done, key, durable))
+        # In a transaction, so that it is told of before its commit: others store it meanwhile.
+        self._commits.submit(Call(run, done, writes=True, durable=durable))
         return decided, committed
-
-    def _decide_now(
-        self,
-        key: str,
-        decide: Callable[[Record | None], Record | None],
-        decided: asyncio.Future[Record | None],
-        committed: asyncio.Future[Record | None],
-        *,
-        durable: bool,
-    ) -> bool:
-        """Decide on the caller's thread, which has the lock; False where the store's thread has to."""
-        found = None if self._commits.closing else self._commits.ahead.known(key, self._commits.picture.look)
-        if found is None:
-            return False
-        try:
-            record = decide(found.record)
-        except Exception as error:  # noqa: BLE001 - a decision's own error is its caller's, whatever it is
-            if found.on_its_way:
-                return False  # whoever is told of a conflict must be able to read what it is with
-            for each in (decided, committed):
-                each.set_exception(error)
-            return True
-        if record is None or record == found.record:
-            if found.on_its_way:
-                return False  # acknowledged only with the commit of what it found done
-            for each in (decided, committed):
-                each.set_result(record)
-            return True
-        self._submit_decided(record, partial(self._post, committed), durable=durable)
-        # The store's thread wants the interpreter, and so does whoever sends the decision to others now: that first.
-        self._loop.call_soon(self.wake)
-        decided.set_result(record)
-        return True
-
-    def decide_now(
-        self,
-        key: str,
-        decide: Callable[[Record | None], Record | None],
-        done: Callable[[Record | None, Exception | None], None],
-        *,
-        durable: bool = True,
-    ) -> Record | None:
-        """Decide on the thread that calls, any, and have the store's commit it; whoever calls wakes that (`wake`).
-
-        Returns:
-            What was decided, of which `done` is told on the store's thread once it is committed; None: nothing was
-            done, since the record's present state is not known here, or it is to stay as it is.
-
-        Raises:
-            RefusedError: the store is closed, or too much waits for the disk.
-            Exception: what `decide` raises.
-        """
-        with self._commits.lock:
-            found = self._commits.ahead.known(key, self._commits.picture.look)
-            record = None if found is None else decide(found.record)
-            if found is None or record is None or record == found.record:
-                return None
-            self._submit_decided(record, done, durable=durable)
-        return record
-
-    def _submit_decided(
-        self, record: Record, done: Callable[[Record | None, Exception | None], None], *, durable: bool
-    ) -> None:
-        mark = Mark(decided=record)
-        call = Call(partial(self._commits.put, record), done, writes=True, durable=durable, mark=mark, single=True)
-        self._commits.submit(call, wake=False)
-
-    def change_then(
-        self,
-        key: str,
-        decide: Callable[[Record | None], Record | None],
-        done: Callable[[Record | None, Exception | None], None],
-        *,
-        durable: bool = True,
-    ) -> None:
-        """Do the same, from any thread; `done` is told on the store's thread, once it is committed.
-
-        Raises:
-            RefusedError: the store is closed, or too much waits for the disk.
-        """
-        self._commits.submit(_change_call(partial(self._change, key, decide), done, key, durable))
 
     def _change(
         self, key: str, decide: Callable[[Record | None], Record | None], db: sqlite3.Connection
@@ -242,7 +148,7 @@ class Store:
         def run(db: sqlite3.Connection) -> None:
             self._commits.dropped([row[0] for row in db.execute(sql, values).fetchall()])
 
-        await self._call(run, writes=True, durable=durable, mark=Mark(touches=""))
+        await self._call(run, writes=True, durable=durable)
 
     # --- the thread -------------------------------------------------------------------------------------------
 
@@ -252,12 +158,9 @@ class Store:
     async def _execute(self, sql: str, *values: Any, durable: bool = True) -> None:
         await self._call(lambda db: db.execute(sql, values) and None, writes=True, durable=durable)
 
-    async def _call(
-        self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True,
-        mark: Mark = NOTHING,
-    ) -> T:  # fmt: skip
+    async def _call(self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True) -> T:
         future: asyncio.Future[Any] = self._loop.create_future()
-        self._commits.submit(Call(run, partial(self._post, future), writes, durable, mark))
+        self._commits.submit(Call(run, partial(self._post, future), writes, durable))
         return cast("T", await future)
 
     def _post(self, future: asyncio.Future[Any], result: Any, error: Exception | None) -> None:
@@ -281,10 +184,9 @@ class Store:
 def _change_call(
     run: Callable[[sqlite3.Connection], Record | None],
     done: Callable[[Any, Exception | None], None],
-    key: str,
     durable: bool,
 ) -> Call:
-    return Call(run, done, writes=True, durable=durable, mark=Mark(touches=key), single=True)
+    return Call(run, done, writes=True, durable=durable, single=True)
 
 
 def _looked_at(future: asyncio.Future[Record | None]) -> None:

@@ -76,7 +76,6 @@ async def test_a_write_that_a_later_one_overtakes_is_done(fleet: Fleet, monkeypa
         return Late(gateway, record) if record.value == b"first" else begin(gateway, record, durable=durable)
 
     monkeypatch.setattr(owner.dht._pushing, "begin", push)
-    monkeypatch.setattr(owner.rpc, "known_way", lambda *_: None)  # none is ordered in place
     writing = asyncio.create_task(owner.dht.write(key, b"first", expected=None))
     while (first := await fleet.planes[0].dht.read(key)) is None:
         await asyncio.sleep(0.01)

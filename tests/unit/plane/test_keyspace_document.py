@@ -13,7 +13,7 @@ from appliance.plane.settings import PlaneConfig
 def test_every_key_is_described(project_root: Path) -> None:
     """Each key name that the key space can make is in the document."""
     text = (project_root / "docs" / "keyspace.md").read_text()
-    described = set(re.findall(r"`((?:gw|task|robot|world|notice|operator|recorder|@answers)/[^`]+)`", text))
+    described = set(re.findall(r"`((?:gw|task|robot|world|notice|operator|recorder)/[^`]+)`", text))
     described |= {f"recorder/{{recorder}}/{name}" for name in ("deleted", "log")}
     keys = Keys("f")
     for name, method in inspect.getmembers(keys, inspect.ismethod):
