@@ -8,7 +8,7 @@ from appliance import cli
 
 COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "task watch",
-    "task why", "task agree", "fleet",
+    "task why", "fleet",
     "pool", "robots list", "robots qgc-actions", "log info", "log replay", "log recover",
     "log merge", "log trim", "log cat", "log pin", "log check", "log trigger",
     "sim mavlink", "sim zenoh", "images build", "images list",
