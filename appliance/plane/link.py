@@ -98,11 +98,6 @@ def asker_of(query: zenoh.Query) -> str:
     return str(source.source_id.zid) if source is not None else ""
 
 
-def is_direct(query: zenoh.Query) -> bool:
-    """Whether the answer to a question never blocks."""
-    return read_mark(query)[0]
-
-
 def reply_direct(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None) -> None:
     """Answer a direct question, on whatever thread; an answer too large for it is empty: ask the other way."""
     reply(query, expr, b"" if answer is not None and len(answer) > MOST_DIRECT else answer, error)
