@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -63,7 +64,7 @@ async def halves(folder: Path) -> AsyncIterator[tuple[Relay, FleetClient, FleetC
     relay = Relay(between, one)
     skills = write_skills(folder)
     async with contextlib.AsyncExitStack() as stack:
-        stack.push_async_callback(remove_fleet, fleet)
+        stack.push_async_callback(partial(remove_fleet, fleet, volumes=True))
         await relay.mend()
         stack.push_async_callback(relay.cut)
         ends = [f"tcp/127.0.0.1:{port}" for port in (one, other)]
