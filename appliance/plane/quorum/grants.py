@@ -137,6 +137,11 @@ def granted(answers: Sequence[Granted], grantors: int) -> bool:
     return sum(answer.granted for answer in answers) >= majority(grantors)
 
 
+def highest(fence: int, answers: Sequence[Granted]) -> int:
+    """The highest fence heard of, an asker's own among them; one that is absurd is not believed."""
+    return max(fence, *(answer.fence for answer in answers if answer.fence <= fence + _MOST_JUMP), 0)
+
+
 def holder(answers: Sequence[Granted], grantors: int) -> tuple[str, float] | None:
     """Who else has the lease, as a majority says, and for how many seconds more; None: nobody is known to."""
     counts = Counter(answer.holder for answer in answers if answer.holder)

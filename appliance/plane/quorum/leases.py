@@ -159,7 +159,7 @@ class Leases:
             return grants.granted(answers, len(grantors)) or grants.holder(answers, len(grantors)) is not None
 
         answers = await self._poll(grantors, "lease_grant", ask, Granted, self.on_grant, enough)
-        self._highest = max(self._highest, *(answer.fence for answer in answers), 0)
+        self._highest = grants.highest(self._highest, answers)
         if not grants.granted(answers, len(grantors)) or until <= _holder_clock():
             return ask.fence, None, answers
         return ask.fence, Lease(key=key, holder=holder, fence=ask.fence, until=until), answers

@@ -13,6 +13,7 @@ from appliance.plane.quorum.grants import (
     LeaseAsk,
     LeaseEnd,
     granted,
+    highest,
     holder,
 )
 
@@ -199,6 +200,8 @@ def test_absurd_fences_and_too_many_grants_are_refused(monkeypatch: pytest.Monke
     grantor = Grantor(fence=0, now=0.0)
     with pytest.raises(PayloadError):
         grantor.grant(ask("a", 2**50), 0.0)
+    assert highest(3, [Granted(fence=7), Granted(fence=2**50)]) == 7
+    assert highest(3, []) == 3
     for number in (1, 2):
         assert grantor.grant(ask("a", number, key=f"k{number}"), 0.0).granted
     with pytest.raises(RefusedError):
