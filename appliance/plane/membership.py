@@ -31,7 +31,7 @@ class Membership:
         self._gateway = gateway
         self._members: frozenset[str] = frozenset() if gateway is None else frozenset({gateway})
         self._made = self._members, Ring(self._members, virtual_nodes=virtual_nodes)
-        """The members that the ring was last made of, and it; replaced whole, by Zenoh's threads too."""
+        """The members that the ring was last made of, and it."""
         self.on_joined: list[Callable[[str], None]] = []
         self.on_lost: list[Callable[[str], None]] = []
         self._tokens: dict[str, set[str]] = {}
@@ -52,10 +52,7 @@ class Membership:
 
     @property
     def ring(self) -> Ring:
-        """The ring of the members; made when it is asked for, so that a burst of news makes it once.
-
-        Reads are answered on Zenoh's threads, which ask for it as well; only the event loop changes the members.
-        """
+        """The ring of the members; made when it is asked for, so that a burst of news makes it once."""
         members, (made_of, ring) = self._members, self._made
         if made_of is not members:
             ring = ring.changed_to(members)

@@ -184,8 +184,8 @@ class Ordering:
     async def _not_from_here(self, newer: list[Record], record: Record) -> list[Record]:
         """Those of what replicas hold in place of a record that this gateway has not itself decided upon it since.
 
-        A later decision may overtake it on the way, one as a query, the other as a plain message: then this write is in
-        what the replica holds, and done. A writer that was told of a conflict would do it a second time.
+        A later decision may overtake it on the way, one sent directly, the other by the sender's queue: then this write
+        is in what the replica holds, and done. A writer that was told of a conflict would do it a second time.
         """
         known: list[Record | None] = []
 

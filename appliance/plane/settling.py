@@ -56,7 +56,7 @@ class Settling:
         return known and settled.owner(key) == self._gateway
 
     def mine(self, key: str) -> bool:
-        """The same, and nobody has come back since who may know more; from any thread."""
+        """The same, and nobody has come back since who may know more."""
         if not self._compared(key):
             return False
         returned = self.returned
