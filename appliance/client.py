@@ -28,7 +28,6 @@ from appliance.pool.transfer.api import Brought, FetchAsk
 from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
 from appliance.steering import SteeringCalls
 from appliance.tasks.api import (
-    AgreeAsk,
     ExperienceAsk,
     ExperienceList,
     PlanAnswer,
@@ -98,10 +97,6 @@ class FleetClient(SteeringCalls):
     async def tasks(self, limit: int) -> TaskList:
         """The newest tasks of the fleet."""
         return await self._ask("tasks", TasksAsk(limit=limit), TaskList)
-
-    async def agree(self, task: str, *, agree: bool = True, by: str = "") -> TaskRecord:
-        """Say yes or no to the plan that is proposed for a task after a failure."""
-        return await self._ask("agree", AgreeAsk(id=task, agree=agree, by=by), TaskRecord)
 
     async def site(self) -> Site:
         """The map by which any one gateway understands names of places."""

@@ -12,11 +12,11 @@ from appliance.plane.browsing import Copy, Listed, RecordList, RecordPlace, Reco
 from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, Written
 from appliance.plane.versions import Record, check_key
 
-How = Literal["owner", "quorum", "replica"]
+How = Literal["owner", "replica"]
 _OURS = ("task/", "checkpoint/", "effect/", "volume/", "lease/")
 """What gateways write themselves, and go by."""
 _WRITE_S = 8.0
-"""Longer than a gateway looks for an owner or a majority: what it says of the outcome is heard."""
+"""Longer than a gateway looks for an owner: what it says of the outcome is heard."""
 
 
 class Held(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -45,14 +45,13 @@ class Records(FleetConnection):
     """What can be done with records through any gateway."""
 
     async def read(self, key: str, how: How = "owner") -> Record:
-        """A record from its owner, as a majority of its voters has it, or from any replica.
+        """A record from its owner, or from any replica.
 
         Raises:
             NotFoundError: there is none.
-            UnreachableError: nobody who has it answers; with a quorum: fewer than a majority do.
-            ConfigError: a quorum was asked for, and no voters are configured.
+            UnreachableError: nobody who has it answers.
         """
-        ask = RecordAsk(key=check_key(key), quorum=how == "quorum", replica=how == "replica")
+        ask = RecordAsk(key=check_key(key), replica=how == "replica")
         found = (await self._ask("record_read", ask, Found)).record
         if found is None or found.deleted:
             raise NotFoundError(f"there is no record {key}", remedy="see `swiftbot plane ls`")
@@ -63,7 +62,7 @@ class Records(FleetConnection):
         return await self._ask("record_place", KeyAsk(check_key(key)), RecordPlace)
 
     async def write(
-        self, key: str, value: bytes, *, expected: VersionVector | None, quorum: bool = False, force: bool = False
+        self, key: str, value: bytes, *, expected: VersionVector | None, force: bool = False
     ) -> VersionVector:
         """Compare and set; errors as for `Dht.write`.
 
@@ -71,19 +70,16 @@ class Records(FleetConnection):
             key: of the record.
             value: its new value.
             expected: the version that it must have; None: there must be none.
-            quorum: ordered by a majority of its voters.
             force: also what gateways write themselves.
         """
         self._check(key, force=force)
-        change = RecordChange(key=key, value=value, expected=expected, quorum=quorum, write=uuid.uuid4().hex)
+        change = RecordChange(key=key, value=value, expected=expected, write=uuid.uuid4().hex)
         return (await self._ask("record_write", change, Written, timeout_s=_WRITE_S)).version
 
-    async def remove(
-        self, key: str, *, expected: VersionVector, quorum: bool = False, force: bool = False
-    ) -> VersionVector:
+    async def remove(self, key: str, *, expected: VersionVector, force: bool = False) -> VersionVector:
         """Remove a record of that version; as `write`."""
         self._check(key, force=force)
-        change = RecordChange(key=key, deleted=True, expected=expected, quorum=quorum, write=uuid.uuid4().hex)
+        change = RecordChange(key=key, deleted=True, expected=expected, write=uuid.uuid4().hex)
         return (await self._ask("record_write", change, Written, timeout_s=_WRITE_S)).version
 
     @staticmethod

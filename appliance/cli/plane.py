@@ -14,9 +14,6 @@ from appliance.errors import ConfigError, Exit, NotFoundError, PayloadError
 
 plane_app = App(name="plane", help="Records of the fleet's plane: read, list, compare and set.", group=TOOLS)
 
-Quorum = Annotated[
-    bool, Parameter(negative="", help="As a majority of the key's voters has it (linearizable); needs plane.voters.")
-]
 Force = Annotated[bool, Parameter(negative="", help="Also what gateways write themselves, such as task/….")]
 Expect = Annotated[
     str, Parameter(help="The version that it must have, as JSON such as '{\"gw-1\": 3}'; by default the present one.")
@@ -33,7 +30,6 @@ def get(
     key: str,
     /,
     *,
-    quorum: Quorum = False,
     replica: Annotated[
         bool, Parameter(negative="", help="From any replica: the fastest answer, which may be behind.")
     ] = False,
@@ -49,9 +45,7 @@ def get(
     from appliance.cli.records import place_table
     from appliance.records import How, Records
 
-    if quorum and replica:
-        raise ConfigError("--quorum and --replica exclude each other", remedy="leave one out")
-    how: How = "quorum" if quorum else "replica" if replica else "owner"
+    how: How = "replica" if replica else "owner"
 
     async def go() -> tuple[Any, Any]:
         async with Records(where.endpoint()) as records:
@@ -82,7 +76,6 @@ def put(
     stdin: Annotated[bool, Parameter(negative="", help="Take the value from standard input.")] = False,
     new: Annotated[bool, Parameter(negative="", help="There must be no such record yet.")] = False,
     expect: Expect = "",
-    quorum: Quorum = False,
     force: Force = False,
     as_json: Json = False,
     where: Where = HERE,
@@ -106,10 +99,10 @@ def put(
             expected = _version(expect) if expect else None
             if not new and not expect:
                 try:
-                    expected = (await records.read(key, "quorum" if quorum else "owner")).version
+                    expected = (await records.read(key)).version
                 except NotFoundError:
                     expected = None
-            return await records.write(key, data, expected=expected, quorum=quorum, force=force)
+            return await records.write(key, data, expected=expected, force=force)
 
     _tell_version(key, asyncio.run(go()), as_json=as_json)
     return 0
@@ -121,7 +114,6 @@ def rm(
     /,
     *,
     expect: Expect = "",
-    quorum: Quorum = False,
     force: Force = False,
     as_json: Json = False,
     where: Where = HERE,
@@ -135,9 +127,8 @@ def rm(
 
     async def go() -> Any:
         async with Records(where.endpoint()) as records:
-            how = "quorum" if quorum else "owner"
-            expected = _version(expect) if expect else (await records.read(key, how)).version
-            return await records.remove(key, expected=expected, quorum=quorum, force=force)
+            expected = _version(expect) if expect else (await records.read(key)).version
+            return await records.remove(key, expected=expected, force=force)
 
     _tell_version(key, asyncio.run(go()), as_json=as_json)
     return 0

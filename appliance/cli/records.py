@@ -20,8 +20,7 @@ def place_table(record: Record, place: RecordPlace, how: str) -> Table:
 
 
 def _caption(place: RecordPlace) -> str:
-    voters = f"voters: {', '.join(place.voters)}" if place.voters else "no quorum: plane.voters is empty"
-    return f"{'the copies agree' if place.agree else 'the copies differ'}; {voters}"
+    return "the copies agree" if place.agree else "the copies differ"
 
 
 def held_table(held: list[Held]) -> Table:

@@ -21,7 +21,7 @@ from appliance.reasons import why_text
 from appliance.steering import cancel_outcome
 from appliance.tasks.view import view
 
-task_app = App(name="task", help="List, show, watch, move, cancel tasks, and agree to new plans.", group=WORK)
+task_app = App(name="task", help="List, show, watch, move and cancel tasks, and decide on their plans.", group=WORK)
 
 
 def add_to(app: App) -> None:
@@ -179,25 +179,6 @@ def _seconds(text: str) -> float | None:
     if not 0 <= seconds < 1e9:
         raise ConfigError(f"--since {text[:40]!r} is no time", remedy="give seconds, or such as 90s, 5m, 2h, now")
     return seconds
-
-
-@task_app.command(name="agree")
-def task_agree(
-    task: str,
-    *,
-    no: Annotated[bool, Parameter(negative="", help="Turn it down: the task fails with what led to it.")] = False,
-    as_json: Json = False,
-    where: Where = HERE,
-) -> int:
-    """Agree to the plan of a task that waits, whichever it is, or turn it down; `task approve` names the one meant."""
-
-    async def go() -> TaskRecord:
-        async with FleetClient(where.endpoint()) as client:
-            return await client.agree(task, agree=not no, by=client.operator)
-
-    record = asyncio.run(go())
-    show(view(record), as_json=as_json, table=console.task_table(record))
-    return 0
 
 
 @task_app.command(name="why")

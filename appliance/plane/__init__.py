@@ -3,6 +3,6 @@
 Doors: `node.Plane` (a gateway's part in the fleet) and `node.PlaneClient` (everybody else's), which put together
 `session.Session` (put, subscribe, query, serve, liveliness), `rpc.Rpc`, `dht.Dht` (records with compare-and-set),
 `registry.Registry` (the latest facts), `store.Store` (what must not be forgotten). `keys` alone knows key names;
-`ring`, `overlay` and `versions` decide without I/O; `bounded` carries out what `overlay` decides for a fleet too large
-for everybody to know everybody, and `router` links such a fleet. docs/keyspace.md describes every key.
+`ring` and `versions` decide without I/O, and so does `overlay`, the ring of a fleet too large for everybody to know
+everybody, which is simulated only. `router` links a large fleet. docs/keyspace.md describes every key.
 """

@@ -25,12 +25,10 @@ class Absence:
 
     Args:
         replicas: copies of a record.
-        whole: whether it knows all members of the ring; of a bounded view members come and go without being lost.
     """
 
-    def __init__(self, *, replicas: int, whole: bool) -> None:
+    def __init__(self, *, replicas: int) -> None:
         self._replicas = replicas
-        self._whole = whole
         self.silent: frozenset[str] = frozenset()
         """Members that are seen and have not answered yet when they were to be compared with."""
         self._gone: dict[str, float] = {}
@@ -41,8 +39,7 @@ class Absence:
     def lost(self, name: str, now: float) -> None:
         """A member is not seen any more."""
         self.silent -= {name}
-        if self._whole:
-            self._gone[name] = now + GONE_S
+        self._gone[name] = now + GONE_S
 
     def asked(self, members: Iterable[str], silent: frozenset[str]) -> None:
         """These were to be compared with, and of these some did not answer."""
@@ -56,13 +53,13 @@ class Absence:
         """The shard is reconciled for a ring: with all who came, but for the silent."""
         for name in ring.members:
             self._gone.pop(name, None)
-        if self._whole and (not self._rings or self._rings[-1].members <= ring.members):
+        if not self._rings or self._rings[-1].members <= ring.members:
             self._rings = (*self._rings[:-1], ring)
 
     def calm(self, ring: Ring, now: float) -> None:
         """All have answered a while after the last change: copies are where they belong on this ring."""
         self._gone = {name: until for name, until in self._gone.items() if until > now}
-        if self._whole and not self.silent:
+        if not self.silent:
             doubtful = (each for each in self._rings if each != ring and len(self._missing(each)) >= self._replicas)
             self._rings = (*doubtful, ring)[-_MOST_RINGS:]
 

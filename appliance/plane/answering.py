@@ -10,14 +10,15 @@ import structlog
 import zenoh
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError, UnreachableError
-from appliance.plane import link, threads
-from appliance.plane.direct import Answer, Asked, Direct
+from appliance.plane import link
 from appliance.plane.doors import Doors
 from appliance.plane.wire import Closer, Wire
 
 log = structlog.get_logger(__name__)
 
 
+Answer = Callable[[bytes | None, SwiftbotError | None], None]
+"""Answers one question, from any thread."""
 Handler = Callable[[str, bytes], Awaitable[bytes]]
 """Answers a question for a key, on the event loop."""
 
@@ -25,28 +26,15 @@ Handler = Callable[[str, bytes], Awaitable[bytes]]
 class Answering:
     """What is served on one session."""
 
-    def __init__(self, wire: Wire, doors: Doors, direct: Direct) -> None:
+    def __init__(self, wire: Wire, doors: Doors) -> None:
         self.wire = wire
         self._doors = doors
-        self._direct = direct
-        self.direct_answer = direct.answer
         self._answering: set[asyncio.Task[None]] = set()
 
-    def serve(
-        self,
-        expr: str,
-        handler: Handler,
-        *,
-        bulk: bool = False,
-        direct: bool = False,
-        at_once: Callable[[bytes, Answer], bool] | None = None,
-    ) -> Closer:
+    def serve(self, expr: str, handler: Handler, *, bulk: bool = False) -> Closer:
         """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
 
         `bulk`: answers are raw bytes and wait in a queue of their own; their priority is that of the question.
-        `direct`: direct questions may come as plain messages too (`plane.direct`).
-        `at_once`: tried first for direct questions, on Zenoh's own thread: it must neither block nor touch what
-        belongs to the event loop. It says whether it answers, or has another thread answer; if not, the handler does.
 
         A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
         and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
@@ -55,20 +43,9 @@ class Answering:
         been seen to deliver a query to the wrong queryable of a session or process, which made one robot do another's
         command. `query` writes down for whom it is; what other Zenoh clients ask says nothing of it.
         """
-        served = Served(self, expr, handler, bulk=bulk, at_once=at_once)
-        queryable = self.wire.raw.declare_queryable(expr, threads.callback(served.take), complete=True)
-        messages = self.take_messages(served) if direct else None
-
-        def end() -> None:
-            if messages is not None:
-                messages.close()
-            queryable.undeclare()
-
-        return Closer(end)
-
-    def take_messages(self, served: "Served") -> Closer:
-        """Have the direct questions for a key come as plain messages too."""
-        return self._direct.serve(served.expr, served.take_message)
+        served = Served(self, expr, handler, bulk=bulk)
+        queryable = self.wire.raw.declare_queryable(expr, link.callback(served.take), complete=True)
+        return Closer(queryable.undeclare)
 
     def begin(self, served: "Served", key: str, data: bytes, reply: Answer) -> None:
         """Have a handler answer, unless too many are at it; on the event loop's thread."""
@@ -141,22 +118,13 @@ class Answering:
 class Served:
     """What answers the questions for one key, or for those of an expression; `take`, on Zenoh's threads, has them."""
 
-    def __init__(
-        self,
-        answering: Answering,
-        expr: str,
-        handler: Handler,
-        *,
-        bulk: bool = False,
-        at_once: Callable[[bytes, Answer], bool] | None = None,
-    ) -> None:
+    def __init__(self, answering: Answering, expr: str, handler: Handler, *, bulk: bool = False) -> None:
         self.expr, self.handler = expr, handler
         self.name = answering.wire.name(expr)
         self.running: set[asyncio.Task[None]] = set()
         self._answering, self._wire = answering, answering.wire
-        self._direct_answer = answering.direct_answer
         self._door = None if "*" in expr else expr.encode()
-        self._bulk, self._at_once = bulk, at_once
+        self._bulk = bulk
 
     def take(self, query: zenoh.Query) -> None:
         """A question came."""
@@ -178,29 +146,6 @@ class Served:
             size = 0
         else:
             data = payload.to_bytes() if payload is not None else b""
-            if (
-                self._at_once is not None
-                and marked
-                and self._at_once(data, partial(link.reply_direct, query, self.expr))
-            ):
-                return
             begin = partial(answering.begin, self, str(query.key_expr), data, reply)
         if not self._wire.inbox.post(begin, size):
             link.reply(query, self.expr, None, RefusedError("too busy", remedy="try again in a moment"))
-
-    def take_message(self, asked: Asked, payload: zenoh.ZBytes) -> None:
-        """A direct question came as a plain message."""
-        answering, expr = self._answering, self.expr
-        size = len(payload)
-        reply = partial(self._direct_answer, asked)
-        if size > link.MOST_DIRECT:
-            error = PayloadError(f"{expr}: {size:,} bytes", remedy=f"at most {link.MOST_DIRECT:,} in a message")
-            begin = partial(answering.refuse, f"oversize {self.name}", expr, reply, error)
-            size = 0
-        else:
-            data = payload.to_bytes()
-            if self._at_once is not None and self._at_once(data, reply):
-                return
-            begin = partial(answering.begin, self, expr, data, reply)
-        if not self._wire.inbox.post(begin, size):
-            reply(None, RefusedError("too busy", remedy="try again in a moment"))

@@ -14,8 +14,7 @@ import structlog
 import zenoh
 
 from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
-from appliance.plane import link, threads
-from appliance.plane.direct import Direct
+from appliance.plane import link
 from appliance.plane.doors import Doors
 from appliance.plane.publishing import Message
 from appliance.plane.wire import Wire
@@ -29,10 +28,9 @@ MOST_ANSWERS = 2_000
 class Asking:
     """The questions under way of one session."""
 
-    def __init__(self, wire: Wire, doors: Doors, direct: Direct) -> None:
+    def __init__(self, wire: Wire, doors: Doors) -> None:
         self._wire = wire
         self._doors = doors
-        self._direct = direct
         self.open: set[asyncio.Future[bytes]] = set()
         """Answers that are awaited."""
 
@@ -41,9 +39,8 @@ class Asking:
     ) -> bytes:
         """Ask whoever serves a key and return the first answer; `bulk`: other messages go before it.
 
-        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full, as a plain
-        message where whoever serves the key takes those (`plane.direct`). For small questions that can be asked again,
-        where the way there and back matters.
+        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full. For small
+        questions that can be asked again, where the way there and back matters.
 
         Raises:
             UnreachableError: nobody serves the key, or (`sent`) whoever may have heard it went away before answering.
@@ -57,7 +54,7 @@ class Asking:
         self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
     ) -> "Question":
         """Do the same, but only send the question, and have the answer awaited afterwards."""
-        return Question(self, self._wire, self._direct, key, payload, timeout_s, bulk=bulk, direct=direct)
+        return Question(self, self._wire, key, payload, timeout_s, bulk=bulk, direct=direct)
 
     async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
         """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out.
@@ -92,7 +89,7 @@ class Asking:
         ask = partial(
             self._wire.raw.get,
             key,
-            threads.callback(take, drop=partial(inbox.post, ended.set, must=True)),
+            link.callback(take, drop=partial(inbox.post, ended.set, must=True)),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -165,7 +162,7 @@ class Asking:
         send = partial(
             self._wire.raw.get,
             expr,
-            threads.callback(take, drop=end),
+            link.callback(take, drop=end),
             target=target,
             consolidation=zenoh.ConsolidationMode.NONE,
             # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
@@ -203,7 +200,6 @@ class Question:
         self,
         asking: Asking,
         wire: Wire,
-        ways: Direct,
         key: str,
         payload: bytes,
         timeout_s: float,
@@ -211,13 +207,12 @@ class Question:
         bulk: bool,
         direct: bool,
     ) -> None:
-        self._asking, self._ways = asking, ways
+        self._asking = asking
         self._key, self._payload = key, payload
         self._timeout_s, self._until = timeout_s, wire.loop.time() + timeout_s
         self._bulk, self._direct = bulk, direct and len(payload) <= link.MOST_DIRECT
         self._loop = wire.loop
         self._answer: asyncio.Future[bytes] = wire.loop.create_future()
-        self._number: int | None = None
         asking.open.add(self._answer)
         self._timer = wire.loop.call_at(self._until, self._on_time)
         try:
@@ -226,20 +221,17 @@ class Question:
             self._answer.set_exception(error)
 
     def _send(self) -> None:
-        if self._direct:
-            self._number = self._ways.ask(self._key, self._payload, self._on_answer, partial(self._on_end, True))
-        if self._number is None:
-            self._asking.get(
-                self._key,
-                self._payload,
-                self._timeout_s,
-                self._on_reply,
-                self._on_end,
-                target=zenoh.QueryTarget.BEST_MATCHING,
-                bulk=self._bulk,
-                direct=self._direct,
-                meant=link.mark(self._key, direct=self._direct),
-            )
+        self._asking.get(
+            self._key,
+            self._payload,
+            self._timeout_s,
+            self._on_reply,
+            self._on_end,
+            target=zenoh.QueryTarget.BEST_MATCHING,
+            bulk=self._bulk,
+            direct=self._direct,
+            meant=link.mark(self._key, direct=self._direct),
+        )
 
     def _on_answer(self, data: bytes | None, error: SwiftbotError | None) -> None:
         if not self._answer.done():
@@ -275,8 +267,6 @@ class Question:
         self._asking.open.discard(self._answer)
         if not self._answer.cancel() and not self._answer.cancelled():
             self._answer.exception()  # looked at: nobody else may come to
-        if self._number is not None:
-            self._ways.forget(self._number)
 
 
 class _Bounds:

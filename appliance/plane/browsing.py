@@ -5,9 +5,8 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from appliance.errors import ConfigError, PayloadError, SwiftbotError
+from appliance.errors import PayloadError, SwiftbotError
 from appliance.model import VersionVector
-from appliance.plane.dht import Dht
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, KeyAsk
 from appliance.plane.rpc import Rpc
@@ -62,8 +61,6 @@ class RecordPlace(Struct, frozen=True, kw_only=True, omit_defaults=True):
     key: str
     owner: str
     replicas: tuple[str, ...]
-    voters: tuple[str, ...] = ()
-    """Who votes on it where a quorum is asked for; empty: nobody does."""
     copies: tuple[Copy, ...] = ()
 
     @property
@@ -75,15 +72,12 @@ class RecordPlace(Struct, frozen=True, kw_only=True, omit_defaults=True):
 class Browsing:
     """Answers questions about records on one gateway."""
 
-    def __init__(
-        self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership, dht: Dht
-    ) -> None:
+    def __init__(self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc, membership: Membership) -> None:
         self._config = config
         self._gateway = gateway
         self._store = store
         self._rpc = rpc
         self._membership = membership
-        self._dht = dht
         rpc.register("records", RecordsAsk, self._on_records, exchange=False)
         rpc.register("record_place", KeyAsk, self._on_place, exchange=False)
 
@@ -101,13 +95,9 @@ class Browsing:
         return RecordList(tuple(listed), more=len(keys) > asked.limit)
 
     async def _on_place(self, asked: KeyAsk) -> RecordPlace:
-        holders = await self._membership.holders(check_key(asked.key), self._config.replicas)
-        try:
-            voters = self._dht.voters(asked.key)
-        except ConfigError:
-            voters = ()
+        holders = self._membership.ring.successors(check_key(asked.key), self._config.replicas)
         copies = await asyncio.gather(*(self._copy(each, asked) for each in holders))
-        return RecordPlace(key=asked.key, owner=holders[0], replicas=holders, voters=voters, copies=tuple(copies))
+        return RecordPlace(key=asked.key, owner=holders[0], replicas=holders, copies=tuple(copies))
 
     async def _copy(self, gateway: str, asked: KeyAsk) -> Copy:
         try:

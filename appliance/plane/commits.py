@@ -16,10 +16,8 @@ from typing import Any, NamedTuple
 import structlog
 
 from appliance.errors import RefusedError
-from appliance.plane.ahead import NOTHING, Ahead, Mark
 from appliance.plane.file import File, problem_of
 from appliance.plane.picture import Picture
-from appliance.plane.room import Room
 from appliance.plane.rows import put_row, read_keys, read_row
 from appliance.plane.versions import Record
 
@@ -38,7 +36,6 @@ class Call(NamedTuple):
     """Told on the store's thread, after the commit."""
     writes: bool
     durable: bool
-    mark: Mark = NOTHING
     single: bool = False
     """It writes with one statement at most."""
 
@@ -54,9 +51,7 @@ class Commits:
         self.file = File(path)
         self.picture = Picture()
         """What is committed."""
-        self.ahead = Ahead()
-        """What is decided and not committed; `lock` guards it."""
-        self.lock = threading.RLock()
+        self._lock = threading.Lock()
         """Under which calls are queued."""
         self.closing = False
         self.watchers: list[Callable[[Record], None]] = []
@@ -75,13 +70,13 @@ class Commits:
         """Open the file, and begin."""
         self._thread.start()
 
-    def submit(self, call: Call, *, wake: bool = True) -> None:
-        """Queue a call, from any thread; without `wake` it waits until something else wakes the thread.
+    def submit(self, call: Call) -> None:
+        """Queue a call, from any thread.
 
         Raises:
             RefusedError: the store is closed, or too much waits for the disk.
         """
-        with self.lock:
+        with self._lock:
             if self.closing:
                 raise RefusedError("the store is closed")
             if len(self._waiting) >= _MOST_WAITING:
@@ -89,22 +84,19 @@ class Commits:
                     f"{len(self._waiting)} calls wait for the disk", remedy="the disk is too slow or fails"
                 )
             self._waiting.append(call)
-            self.ahead.queued(call.mark)
-            if wake:
-                self.wake()
+            self._wake()
 
-    def wake(self) -> None:
-        """Have the thread look what waits; from any thread."""
-        with self.lock:
-            if not self._signalled:
-                self._signalled = True
-                self._signals.put(None)
+    def _wake(self) -> None:
+        """Have the thread look what waits; whoever calls has the lock."""
+        if not self._signalled:
+            self._signalled = True
+            self._signals.put(None)
 
     def close(self) -> None:
         """Do what waits, then close the file; blocks."""
-        with self.lock:
+        with self._lock:
             self.closing = True
-            self.wake()
+            self._wake()
         self._thread.join()
 
     # --- what calls do ----------------------------------------------------------------------------------------
@@ -140,12 +132,8 @@ class Commits:
             self._opened(error)
             return
         self._opened(None)
-        room = Room(self.path)
         while batch := self._take():
             self._do(db, batch)
-            if self._durable(batch):
-                room.make()
-        room.close()
         with contextlib.suppress(sqlite3.Error):
             db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.close()
@@ -155,12 +143,12 @@ class Commits:
         """Wait for calls; none: it is to close, and all that waited is done."""
         while True:
             self._signals.get()
-            with self.lock:
+            with self._lock:
                 self._signalled = False
                 waiting = self._waiting
                 batch = [waiting.popleft() for _ in range(min(len(waiting), _MOST_TOGETHER))]
                 if batch and (waiting or self.closing):
-                    self.wake()
+                    self._wake()
                 if batch or self.closing:
                     return batch
 
@@ -177,10 +165,6 @@ class Commits:
             problem = problem_of(error, self.path)
             log.error("the store failed", path=str(self.path), reason=str(problem))  # noqa: TRY400 - cause named
             outcomes = [(None, problem)]
-        # What they did, or failed to, shows in the picture: they stand in no decision's way any more.
-        with self.lock:
-            for call in batch:
-                self.ahead.settled(call.mark)
         for call, (result, error) in zip(batch, outcomes, strict=True):
             try:
                 call.done(result, error)

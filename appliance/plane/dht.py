@@ -23,9 +23,8 @@ from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, Sto
 from appliance.plane.ordering import Ordering
 from appliance.plane.pulse import Pulse
 from appliance.plane.pushing import Pushing
-from appliance.plane.quorum.voting import Voting
 from appliance.plane.rows import LeaveOut
-from appliance.plane.rpc import AtOnce, Rpc
+from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.settling import Settling
 from appliance.plane.store import Store
@@ -66,7 +65,6 @@ class Dht:
         rpc: Rpc,
         membership: Membership,
         pulse: Pulse,
-        voting: Voting,
     ) -> None:
         self.resolver: Resolver | None = None
         self.on_ring_change: list[Callable[[], None]] = []
@@ -76,46 +74,35 @@ class Dht:
         self._rpc = rpc
         self._membership = membership
         self._pulse = pulse
-        self._voting = voting
-        voting.resolver = lambda: self.resolver or by_bytes
         self.settling = Settling(
             gateway=gateway, membership=membership, pulse=pulse, replicas=config.replicas,
             virtual_nodes=config.virtual_nodes,
         )  # fmt: skip
-        self.absence = Absence(replicas=config.replicas, whole=config.view == "full")
+        self.absence = Absence(replicas=config.replicas)
         self._pushing = Pushing(config, gateway=gateway, store=store, rpc=rpc, membership=membership, keep=self.keep)
-        voting.learn = self._pushing.learn
         self.ordering = Ordering(
             config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
             pushing=self._pushing, keep=self.keep,
         )  # fmt: skip
-        self.on_ring_change.append(self.ordering.fast.ring_changed)
-        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False, direct=True, at_once=self._read_at_once)
-        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False, direct=True, at_once=self._store_at_once)
+        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False)
+        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False)
         rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
         rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
 
     # --- the door ---------------------------------------------------------------------------------------------
 
-    async def read(self, key: str, *, quorum: bool = False, replica: bool = False) -> Record | None:
+    async def read(self, key: str, *, replica: bool = False) -> Record | None:
         """Return a record from its owner or, when that does not answer, the next replica; None: there is none.
 
         That there is none only the key's owner knows, and only when it has heard all that may have a copy: what a
         replica lacks the owner may have, which was slow to tell.
 
-        `quorum`: as a majority of the key's voters has it, so that no write with a quorum that was acknowledged
-        before is missed (linearizable, `plane.quorum`).
         `replica`: as this gateway has it if it holds a copy, else as any of those that do; it may be behind.
 
         Raises:
-            UnreachableError: whoever answered has none, and others may have one; `quorum`: fewer than a majority of the
-                voters answered.
-            ConfigError: `quorum`, and no voters are configured.
+            UnreachableError: whoever answered has none, and others may have one.
         """
         check_key(key)
-        if quorum:
-            chosen = await self._voting.read(key)
-            return None if chosen is None or chosen.deleted else chosen
         loop = asyncio.get_running_loop()
         until = loop.time() + _APART_S
         while True:
@@ -135,7 +122,7 @@ class Dht:
             What was found, and whether that may be about to change: the owner says that the key is another's, or is not
             there or about to go, of which the membership will tell.
         """
-        holders = list(await self._membership.holders(key, self._config.replicas))
+        holders = list(self._membership.ring.successors(key, self._config.replicas))
         owner, problems, apart = holders[0], dict[str, str](), False
         if replica:
             random.shuffle(holders)
@@ -160,43 +147,26 @@ class Dht:
         return Found(unsure=problems.get(owner) or "its owner was not asked"), apart
 
     async def write(
-        self,
-        key: str,
-        value: bytes,
-        *,
-        expected: VersionVector | None,
-        durable: bool = True,
-        quorum: bool = False,
+        self, key: str, value: bytes, *, expected: VersionVector | None, durable: bool = True
     ) -> VersionVector:
         """Compare and set: `expected` is the version that was read, None when there must be no record.
 
-        `quorum`: ordered by a majority of the key's voters, so that two parts of a fleet that are cut off from each
-        other cannot both change it. All writers of a key must ask for it, or none: a plain write is not ordered with
-        those.
-
         Returns:
             The new version; by then the value is on the disk of the owner and of every reachable replica (not
-            `durable`: written, but the last moments may be lost with the power of all of them; `quorum`: on the
-            disks of a majority of the voters, in any case).
+            `durable`: written, but the last moments may be lost with the power of all of them).
 
         Raises:
             ConflictError: the record has moved on; read, decide again, retry.
-            UnreachableError: no owner, or no majority of the voters, could be reached within `write_timeout_s`; it
-                may or may not be written.
-            ConfigError: `quorum`, and no voters are configured.
+            UnreachableError: no owner could be reached within `write_timeout_s`; it may or may not be written.
             PayloadError: the value or key is too large.
         """
         asked = Write(key=key, value=value, expected=expected, write=secrets.token_hex(16), durable=durable)
-        return await (self._voting.write(asked) if quorum else self._write(asked))
+        return await self._write(asked)
 
-    async def remove(self, key: str, *, expected: VersionVector, quorum: bool = False) -> None:
+    async def remove(self, key: str, *, expected: VersionVector) -> None:
         """Remove a record; errors as for `write`."""
         asked = Write(key=key, deleted=True, expected=expected, write=secrets.token_hex(16))
-        await (self._voting.write(asked) if quorum else self._write(asked))
-
-    def voters(self, key: str) -> tuple[str, ...]:
-        """The gateways that vote on a key where a quorum is asked for; ConfigError when none are configured."""
-        return self._voting.voters(check_key(key))
+        await self._write(asked)
 
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
@@ -226,9 +196,9 @@ class Dht:
         until = loop.time() + self._config.write_timeout_s
         while True:
             try:
-                (owner,) = await self._membership.holders(asked.key, 1)
+                owner = self._membership.ring.owner(asked.key)
                 if owner == self._gateway:
-                    return (await self.ordering.own(asked)).version
+                    return (await self.ordering.order(asked)).version
                 answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 # Dead, not yet known to be; or of another mind about who owns the key: both pass.
@@ -263,33 +233,6 @@ class Dht:
         record = await self._store.record(key)
         return Found(record) if record is not None else await self._on_read(KeyAsk(key))
 
-    def _read_at_once(self, asked: KeyAsk, answer: AtOnce) -> bool:
-        """Answer a read on Zenoh's thread, where the ring is known whole and the record is in memory.
-
-        Whether there is none is for the event loop to say: it knows who was not heard.
-        """
-        key = check_key(asked.key)
-        if self._config.view != "full" or (self._membership.owns(key) and not self.settling.mine(key)):
-            return False
-        _, record = self._store.look(key)
-        if record is not None:
-            answer(Found(record))
-        return record is not None
-
-    def _store_at_once(self, asked: StoreAsk, answer: AtOnce) -> bool:
-        """Have the store's thread keep a record and answer, without a turn of the event loop."""
-        record = check_record(asked.record, max_bytes=self._config.max_record_bytes)
-
-        def done(kept: Record | None, error: Exception | None) -> None:
-            if error is not None:
-                answer(error if isinstance(error, SwiftbotError) else SwiftbotError(f"not stored: {error}"))
-            else:
-                answer(Found(None if kept == record else kept))
-
-        order = partial(_settle, record, self.resolver or by_bytes)
-        self._store.change_then(record.key, order, done, durable=asked.durable)
-        return True
-
     async def _on_store(self, asked: StoreAsk) -> Found:
         check_record(asked.record, max_bytes=self._config.max_record_bytes)
         kept = await self.keep(asked.record)
@@ -302,7 +245,7 @@ class Dht:
         return record if kept is None else kept
 
     async def _on_record_read(self, asked: RecordAsk) -> Found:
-        return Found(await self.read(asked.key, quorum=asked.quorum, replica=asked.replica))
+        return Found(await self.read(asked.key, replica=asked.replica))
 
     async def _on_record_write(self, asked: RecordChange) -> Written:
         write = Write(
@@ -313,11 +256,10 @@ class Dht:
             write=asked.write or secrets.token_hex(16),
         )
         check_write(write, max_bytes=self._config.max_record_bytes)
-        return Written(await (self._voting.write(write) if asked.quorum else self._write(write)))
+        return Written(await self._write(write))
 
     async def close(self) -> None:
         """Give up what is still being written and pushed."""
-        await self.ordering.fast.close()
         await self._pushing.close()
 
 

@@ -9,14 +9,7 @@ import re
 from appliance.errors import PayloadError
 
 ROOT = "swiftbot"
-DOOR = "@direct"
-"""Last chunk of the keys of direct questions: no wildcard matches one that begins with `@`."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
-
-
-def door_of(key: str) -> str:
-    """Where direct questions for a key, and for all others beside it, are put."""
-    return f"{key.rpartition('/')[0]}/{DOOR}"
 
 
 def check_name(name: str, what: str) -> str:
@@ -65,14 +58,6 @@ class Keys:
     def rpc(self, gateway: str, verb: str = "*") -> str:
         """Queryable: a request to one gateway, answered with the verb's reply or ErrorReply."""
         return f"{self.root}/gw/{gateway}/rpc/{verb}"
-
-    def direct(self, gateway: str) -> str:
-        """Put by the asking gateway: a small question for one of its verbs, as a message (`plane.direct`)."""
-        return door_of(self.rpc(gateway, ""))
-
-    def answers(self, session: str) -> str:
-        """Put by the gateway that was asked: answers to the direct questions of that Zenoh session."""
-        return f"{self.root}/@answers/{session}"
 
     def backlog(self, session: str) -> str:
         """Queryable of each session that puts: what it has put lately (`plane.backlog`), for recorders."""

@@ -8,7 +8,7 @@ Split from `session` so that what is particular to the library's version stands 
 import contextlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 import structlog
@@ -21,6 +21,8 @@ from appliance.plane.settings import PlaneConfig
 
 log = structlog.get_logger(__name__)
 
+T = TypeVar("T")
+
 _WIRE_HEADROOM = 8
 """Zenoh itself drops messages of more than so many times the largest payload, before they are whole in memory."""
 
@@ -31,6 +33,11 @@ def open_raw(config: PlaneConfig, gateway: str = "") -> zenoh.Session:
         return zenoh.open(_zenoh_config(config, gateway))
     except zenoh.ZError as error:
         raise _open_error(config, str(error)) from error
+
+
+def callback(take: Callable[[T], None], *, drop: Callable[[], object] | None = None) -> "zenoh.handlers.Callback[T]":
+    """A callback that Zenoh calls where it reads, without a thread between: it must only hand over."""
+    return zenoh.handlers.Callback(take, drop=drop, indirect=False)
 
 
 def reply(
@@ -89,11 +96,6 @@ def asker_of(query: zenoh.Query) -> str:
     """The session that a question says it is of; "" where it does not say."""
     source = query.source_info
     return str(source.source_id.zid) if source is not None else ""
-
-
-def is_direct(query: zenoh.Query) -> bool:
-    """Whether the answer to a question never blocks."""
-    return read_mark(query)[0]
 
 
 def reply_direct(query: zenoh.Query, expr: str, answer: bytes | None, error: SwiftbotError | None) -> None:

@@ -31,7 +31,7 @@ class Membership:
         self._gateway = gateway
         self._members: frozenset[str] = frozenset() if gateway is None else frozenset({gateway})
         self._made = self._members, Ring(self._members, virtual_nodes=virtual_nodes)
-        """The members that the ring was last made of, and it; replaced whole, by Zenoh's threads too."""
+        """The members that the ring was last made of, and it."""
         self.on_joined: list[Callable[[str], None]] = []
         self.on_lost: list[Callable[[str], None]] = []
         self._tokens: dict[str, set[str]] = {}
@@ -52,10 +52,7 @@ class Membership:
 
     @property
     def ring(self) -> Ring:
-        """The ring of the members; made when it is asked for, so that a burst of news makes it once.
-
-        Reads are answered on Zenoh's threads, which ask for it as well; only the event loop changes the members.
-        """
+        """The ring of the members; made when it is asked for, so that a burst of news makes it once."""
         members, (made_of, ring) = self._members, self._made
         if made_of is not members:
             ring = ring.changed_to(members)
@@ -65,9 +62,6 @@ class Membership:
     def sees(self, name: str) -> bool:
         """Whether a gateway counts as there for its questions about records."""
         return name in self._members
-
-    def hold(self, who: str, names: frozenset[str]) -> None:
-        """Stay aware of these while they are there, for `who`; none: no more. Nothing to do where all are known."""
 
     def seen_since(self, moment: float) -> frozenset[str]:
         """The other members whose token was there at a moment of the pulse's clock and has never gone since."""
@@ -80,16 +74,6 @@ class Membership:
     def owns(self, key: str) -> bool:
         """Whether a key belongs to this gateway just now."""
         return self.ring.owner(key) == self._gateway
-
-    async def holders(self, key: str, n: int) -> tuple[str, ...]:
-        """The first `n` gateways from the key's position on, its owner first; UnreachableError when there is none."""
-        return self.ring.successors(key, n)
-
-    async def enter(self) -> None:
-        """Find one's place among the members; nothing to do where all are known."""
-
-    async def leave(self) -> None:
-        """Tell the neighbours that one goes; nothing to do where all see the token go."""
 
     def start(self) -> None:
         """Begin to watch."""

@@ -40,7 +40,6 @@ class RecordAsk(Struct, frozen=True, omit_defaults=True):
     """`record_read`: a record, from whoever holds it; the answer of `read`, tombstones left out."""
 
     key: str
-    quorum: bool = False
     replica: bool = False
     """From whichever replica answers first, which may be behind its owner; one that is asked here if it is one."""
 
@@ -52,6 +51,5 @@ class RecordChange(Struct, frozen=True, kw_only=True, omit_defaults=True):
     value: bytes = b""
     deleted: bool = False
     expected: VersionVector | None = None
-    quorum: bool = False
     write: str = ""
     """An id of the caller's own makes asking again safe; empty: one is made."""

@@ -12,7 +12,6 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError
-from appliance.plane.bounded import BoundedMembership
 from appliance.plane.browsing import Browsing
 from appliance.plane.dht import Dht
 from appliance.plane.dialling import dialled
@@ -21,8 +20,7 @@ from appliance.plane.membership import Membership
 from appliance.plane.namesake import displaced
 from appliance.plane.outlived import Outlived
 from appliance.plane.pulse import Pulse
-from appliance.plane.quorum.forgetting import Forgetting
-from appliance.plane.quorum.voting import Voting
+from appliance.plane.quorum import Leases
 from appliance.plane.reconcile import Reconciler
 from appliance.plane.registry import Registry
 from appliance.plane.ring import Ring
@@ -73,22 +71,18 @@ class Plane:
         self.store = store
         self.keys: Keys = session.keys
         self.rpc = Rpc(session, gateway)
-        self._membership = _membership(config, session, self.rpc, gateway)
+        self._membership = Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
         self._pulse = Pulse(config.lease_ms / 1e3)
-        self._outlived: Outlived | None = None
-        # A bounded view changes all the time: who is new in it does not tell that others noticed a standstill.
-        if config.view == "full":
-            self._outlived = Outlived(
-                self._pulse,
-                lease_s=config.lease_ms / 1e3,
-                members=self._membership,
-                answers=self._answers,
-                sees=self._sees,
-                renew=session.renew_links,
-            )
-        self._voting = Voting(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
-        self._forgetting = Forgetting(self._voting, gateway=gateway, store=store, kept_hours=config.tombstone_hours)
+        self._outlived = Outlived(
+            self._pulse,
+            lease_s=config.lease_ms / 1e3,
+            members=self._membership,
+            answers=self._answers,
+            sees=self._sees,
+            renew=session.renew_links,
+        )
+        self.leases = Leases(config, gateway=gateway, store=store, rpc=self.rpc)
         self.dht = Dht(
             config,
             gateway=gateway,
@@ -96,9 +90,8 @@ class Plane:
             rpc=self.rpc,
             membership=self._membership,
             pulse=self._pulse,
-            voting=self._voting,
         )
-        Browsing(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership, dht=self.dht)
+        Browsing(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self._reconciler = Reconciler(
             config,
             gateway=gateway,
@@ -189,23 +182,20 @@ class Plane:
 
     async def _join(self) -> None:
         membership = self._membership
-        await self._voting.voter.start(lost=self.store.set_aside is not None)
+        await self.leases.start(lost=self.store.set_aside is not None)
         if self.config.connect or set(self.config.peers) - {self.gateway}:
             await self._first_link()
         self._reached("linked")
         present = await self._present()
         self._reached("present")
-        # With a full view nobody is told of this gateway before its token shows: it may look for its records meanwhile.
+        # Nobody is told of this gateway before its token shows: it may look for its records meanwhile.
         checking = asyncio.create_task(self._check_free(present), name="is the name free")
         try:
-            if self.config.view != "full":
-                await checking
             for name in present:
                 membership.add(name)
             membership.start()
             self._pulse.start()
             self.registry.start()
-            await membership.enter()
             if self._away_s > AWAY_S:
                 await self._reconciler.join()
             self._reached("fetched")
@@ -215,15 +205,13 @@ class Plane:
         membership.join()
         self._reached("joined")
         self._reconciler.start()
-        if self.gateway in self.config.voters:
-            self._forgetting.start()
         log.info("joined", gateway=self.gateway, members=sorted(membership.members))
         self._unseen = asyncio.get_running_loop().call_later(UNSEEN_S, self._tell_unseen)
 
     def _tell_unseen(self) -> None:
         """Say which gateways of the table have not come: two that each wait for the other's call are two fleets."""
         unseen = sorted(set(self.config.peers) - self._membership.members - {self.gateway})
-        if unseen and self.config.view == "full":
+        if unseen:
             ours = dialled(self.gateway, self.config.peers)
             log.warning(
                 "gateways named in plane.peers are not seen",
@@ -289,44 +277,24 @@ class Plane:
         return self._membership.ring
 
     async def owner_of(self, key: str) -> str:
-        """The gateway that a key belongs to: at once where the ring is known whole, else found by asking one's way.
-
-        Raises:
-            UnreachableError: nobody knows just now.
-        """
-        (owner,) = await self._membership.holders(key, 1)
-        return owner
+        """The gateway that a key belongs to."""
+        return self._membership.ring.owner(key)
 
     def members(self) -> frozenset[str]:
         """Ids of the gateways that are there, this one among them."""
         return self._membership.members
 
     def sees(self, name: str) -> bool:
-        """Whether a gateway may be there, as far as this one can tell: with a bounded view any may."""
+        """Whether a gateway is there, as far as this one can tell."""
         return self._membership.sees(name)
-
-    def hold(self, who: str, names: frozenset[str]) -> None:
-        """Have these gateways count as members for as long as they are there, for `who` (none of them: no more).
-
-        With a bounded view a gateway that is there leaves it now and then, and would be taken for lost; and one that is
-        in nobody's view would not be missed. Where all are known nothing is to do.
-        """
-        self._membership.hold(who, names)
-
-    async def holders(self, key: str, n: int) -> tuple[str, ...]:
-        """The first `n` gateways from a key's position on, its owner first; UnreachableError when nobody knows."""
-        return await self._membership.holders(key, n)
 
     async def close(self) -> None:
         """Leave the fleet and close the store; more than once does no harm."""
         if self._unseen is not None:
             self._unseen.cancel()
-        if self._outlived is not None:
-            await self._outlived.close()
-        await self._membership.leave()
+        await self._outlived.close()
         self._membership.close()
         await self._reconciler.close()
-        await self._forgetting.close()
         await self.dht.close()
         await self.registry.close()
         self.rpc.close()
@@ -356,12 +324,6 @@ async def _open_both(config: PlaneConfig, fleet: str, gateway: str, path: Path) 
     except BaseException:
         await session.close()
         raise
-
-
-def _membership(config: PlaneConfig, session: Session, rpc: Rpc, gateway: str) -> Membership:
-    if config.view == "full":
-        return Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
-    return BoundedMembership(session, rpc, gateway=gateway, bound=config.view, replicas=config.replicas)
 
 
 class PlaneClient:

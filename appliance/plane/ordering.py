@@ -1,22 +1,17 @@
-"""Writes as the owner of their keys orders them: one after the other, and on the replicas before it acknowledges.
-
-The ordinary ones never come here (`fastpath`); what is here knows what to do when the owner is behind its writer or has
-just become the owner, when a replica holds what it had not seen, and when a commit failed.
-"""
+"""Writes as the owner of their keys orders them: one after the other, and on the replicas before it acknowledges."""
 
 import asyncio
 import contextlib
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 
 from appliance.errors import ConflictError, RefusedError, SwiftbotError
 from appliance.model import VersionVector
-from appliance.plane.fastpath import FastPath
-from appliance.plane.lately import Lately
 from appliance.plane.membership import Membership
 from appliance.plane.messages import Found, KeyAsk, Written
 from appliance.plane.pulse import Pulse
 from appliance.plane.pushing import Pushing
-from appliance.plane.rpc import AtOnce, Rpc
+from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.settling import RETURNED_S, Settling
 from appliance.plane.store import Store
@@ -29,6 +24,40 @@ from appliance.plane.versions import (
     descends,
     follows_here,
 )
+
+_MOST_REMEMBERED = 4096
+"""Writes whose ids are remembered: who asks again does so within seconds."""
+
+
+class Acknowledged:
+    """The writes that this gateway ordered last, by their ids.
+
+    A writer whose answer was lost asks again with the same id. While its write is the newest the record itself tells;
+    once another has followed it, only whoever ordered it knows that it is done, and a writer that heard of a conflict
+    would do it a second time.
+    """
+
+    def __init__(self, most: int = _MOST_REMEMBERED) -> None:
+        self._most = most
+        self._known: OrderedDict[tuple[str, str], VersionVector | None] = OrderedDict()
+        """Key and id -> the version it made; None: it is under way."""
+
+    def note(self, key: str, write: str, version: VersionVector | None) -> None:
+        """A write was ordered (None), or acknowledged with a version."""
+        if not write:
+            return
+        self._known[key, write] = version
+        self._known.move_to_end((key, write))
+        if len(self._known) > self._most:
+            self._known.popitem(last=False)
+
+    def failed(self, key: str, write: str) -> None:
+        """It was not acknowledged: asked again, it is looked at anew."""
+        self._known.pop((key, write), None)
+
+    def of(self, key: str, write: str) -> tuple[bool, VersionVector | None]:
+        """Whether a write is known here, and the version it made once it is acknowledged."""
+        return (key, write) in self._known, self._known.get((key, write))
 
 
 class Ordering:
@@ -58,20 +87,8 @@ class Ordering:
         self._keep = keep
         self._unsaved: set[str] = set()
         """Keys whose last decision here the replicas may have and the disk has not."""
-        self._lately = Lately()
-        self.fast = FastPath(
-            config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=settling, pulse=pulse,
-            pushing=pushing, unsaved=self._unsaved, lately=self._lately, agree=self._agree,
-        )  # fmt: skip
-        rpc.register("dht_write", Write, self.order, exchange=False, direct=True, at_once=self._order_at_once)
-
-    async def own(self, asked: Write) -> Written:
-        """Order a write of this gateway's own; errors as of `order`."""
-        return await self.fast.write(asked) or await self.order(asked)
-
-    def _order_at_once(self, asked: Write, answer: AtOnce) -> bool:
-        """Order an ordinary write on Zenoh's thread."""
-        return self.fast.order(check_write(asked, max_bytes=self._config.max_record_bytes), answer)
+        self._acknowledged = Acknowledged()
+        rpc.register("dht_write", Write, self.order, exchange=False)
 
     async def order(self, asked: Write) -> Written:
         """Order a write as the owner of its key, and have the replicas follow.
@@ -98,19 +115,19 @@ class Ordering:
                 f"{asked.key}: nobody here knows the version expected", remedy="read it and decide again"
             ) from None
         except ConflictError:
-            known, done = self._lately.of(asked.key, asked.write)
+            known, done = self._acknowledged.of(asked.key, asked.write)
             if done is not None:
                 return Written(done)
             if known:
                 raise RefusedError(f"{asked.key} is being written so", remedy="ask again in a moment") from None
             raise
-        self._lately.began(asked.key, asked.write)
+        self._acknowledged.note(asked.key, asked.write, None)
         try:
             version = await self._replicate(record, asked, committed)
         except BaseException:
-            self._lately.failed(asked.key, asked.write)
+            self._acknowledged.failed(asked.key, asked.write)
             raise
-        self._lately.ended(asked.key, asked.write, version)
+        self._acknowledged.note(asked.key, asked.write, version)
         return Written(version)
 
     def _check_owned(self, key: str) -> None:
@@ -172,8 +189,8 @@ class Ordering:
     async def _not_from_here(self, newer: list[Record], record: Record) -> list[Record]:
         """Those of what replicas hold in place of a record that this gateway has not itself decided upon it since.
 
-        A later decision may overtake it on the way, one as a query, the other as a plain message: then this write is in
-        what the replica holds, and done. A writer that was told of a conflict would do it a second time.
+        A later decision may overtake it on the way, one sent directly, the other by the sender's queue: then this write
+        is in what the replica holds, and done. A writer that was told of a conflict would do it a second time.
         """
         known: list[Record | None] = []
 

@@ -1,8 +1,8 @@
-"""The committed records in memory, for whoever may not wait for the store's thread.
+"""The committed records in memory: reads on the event loop are answered from it, without the store's thread.
 
-Zenoh's threads answer reads from it where they stand. It is written only after a commit, by the store's thread, so
-that nobody is told what a failing disk could still take back. All keys are known, so that it can say that there is no
-such record; of the records as many as fit, those used last.
+It is written only after a commit, by the store's thread, so that nobody is told what a failing disk could still take
+back. All keys are known, so that it can say that there is no such record; of the records as many as fit, those used
+last.
 """
 
 import threading

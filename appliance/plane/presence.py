@@ -10,7 +10,7 @@ from typing import cast
 
 import zenoh
 
-from appliance.plane import threads
+from appliance.plane import link
 from appliance.plane.wire import Closer, Wire
 
 
@@ -46,7 +46,7 @@ class Presence:
         ask = partial(
             self._wire.raw.liveliness().get,
             expr,
-            threads.callback(take, drop=partial(inbox.post, ended.set, must=True)),
+            link.callback(take, drop=partial(inbox.post, ended.set, must=True)),
             timeout=timeout_s,
         )
         self._wire.send(expr, cast("Callable[[], None]", ask), 0)
@@ -68,7 +68,7 @@ class Presence:
                 callback(key, alive)
 
         # What comes before `closer` is bound waits in the inbox: it is delivered by a later turn of the loop.
-        handler = threads.callback(take)
+        handler = link.callback(take)
         subscriber = self._wire.raw.liveliness().declare_subscriber(expr, handler, history=True)
         closer = Closer(subscriber.undeclare)
         return closer

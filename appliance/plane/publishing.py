@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
-from appliance.plane import threads
+from appliance.plane import link
 from appliance.plane.flood import Flood
 from appliance.plane.wire import Closer, Wire
 
@@ -116,7 +116,7 @@ class Publishing:
             if not closer.closed:
                 callback(message)
 
-        subscriber = self._wire.raw.declare_subscriber(expr, threads.callback(take))
+        subscriber = self._wire.raw.declare_subscriber(expr, link.callback(take))
         closer = Closer(subscriber.undeclare)
         return closer
 

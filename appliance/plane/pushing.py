@@ -1,4 +1,4 @@
-"""Copies of a record on their way to its replicas: with a write, again to one that was too slow, after a quorum."""
+"""Copies of a record on their way to its replicas: with a write, and again to one that was too slow."""
 
 import asyncio
 import contextlib
@@ -88,20 +88,6 @@ class Pushing:
             self._later(self._push_again(gateway, record.key))
         else:
             log.error("a replica cannot store", replica=gateway, key=record.key, reason=str(error))
-
-    async def learn(self, record: Record) -> None:
-        """A quorum has chosen a record: the ordinary copies follow, while the writer goes on."""
-        if len(self._pushes) >= _MOST:
-            await self._spread(record)
-        else:
-            self._later(self._spread(record))
-
-    async def _spread(self, record: Record) -> None:
-        with contextlib.suppress(SwiftbotError):  # nobody to hold a copy is reached: a later one comes with the next
-            holders = await self._membership.holders(record.key, self._config.replicas)
-            if self._gateway in holders:
-                await self._keep(record)
-            await asyncio.gather(*(self.push(each, record) for each in holders if each != self._gateway))
 
     def _later(self, push: Coroutine[Any, Any, None]) -> None:
         if len(self._pushes) >= _MOST:

@@ -103,9 +103,7 @@ class Reconciler:
     def _on_lost(self, name: str) -> None:
         self._dht.settling.returned -= {name}
         now = time.monotonic()
-        if self._config.view == "full":
-            # A bounded view drops members that are there, and need not see whoever asks.
-            self._lost[name] = now + GONE_S
+        self._lost[name] = now + GONE_S
         self._dht.absence.lost(name, now)
         self._lost_at = now if self._lost_at is None else self._lost_at
         self._changed.set()

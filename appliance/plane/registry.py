@@ -64,9 +64,7 @@ class Registry:
         self._rpc = rpc
         self._membership = membership
         self._gateway = gateway
-        self._bounded = gateway is not None and config.view != "full"
         self._closers: list[Closer] = []
-        self._of_member: dict[str, tuple[Closer, ...]] = {}
         self._heard: dict[str, int] = {}
         self._as_of: dict[str, float] = {}
         """Gateway -> when, on this clock, its status was so; what is known of its containers held then."""
@@ -95,14 +93,10 @@ class Registry:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
         self._roster.start()
-        if self._bounded and self._gateway is not None:
-            # Nobody in particular is listened to yet, but whoever goes by this gateway's own name.
-            self._closers = [session.subscribe_typed(keys.status(self._gateway), GatewayStatus, self._on_status)]
-        else:
-            self._closers = [
-                session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
-                session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
-            ]
+        self._closers = [
+            session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
+            session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
+        ]
 
     @property
     def lost_ns(self) -> Mapping[str, int]:
@@ -267,12 +261,6 @@ class Registry:
         """A member has come: what it put before we listened must be asked for, of it or of one that has heard it."""
         if gateway == self._gateway:
             return
-        if self._bounded and gateway not in self._of_member:
-            keys, session = self._session.keys, self._session
-            self._of_member[gateway] = (
-                session.subscribe_typed(keys.status(gateway), GatewayStatus, self._on_status),
-                session.subscribe_typed(keys.container(gateway), ContainerInfo, self._on_container),
-            )
         if len(self._membership.members) <= FEW:
             # One that has only just come has better to do, and tells its own facts besides.
             self._ask(gateway, after_s=0.0 if self._gateway is None else random.uniform(*_SOON_S))  # noqa: S311
@@ -382,8 +370,6 @@ class Registry:
         """A gateway is lost: what it said goes with it, what it said of itself no longer holds."""
         if task := self._asking.pop(gateway, None):
             task.cancel()
-        for closer in self._of_member.pop(gateway, ()):
-            closer.close()
         self._drop_ages(gateway)
         self._missing.discard(gateway)
         for noted in (self._heard, self._as_of, self._doubted, self._asked_by):
@@ -404,7 +390,7 @@ class Registry:
         """Publish what waits, listen no more."""
         if self._speaker is not None:
             self._speaker.close()
-        for closer in (*self._closers, *(each for both in self._of_member.values() for each in both)):
+        for closer in self._closers:
             closer.close()
         await self._roster.close()
         if self.namesakes is not None:

@@ -7,23 +7,18 @@ any Zenoh client can see it; what would be too large there is named by its diges
 import hashlib
 import time
 from collections.abc import Awaitable, Callable
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 import msgspec
 from msgspec import Raw, Struct
 
-from appliance.errors import ConfigError, PayloadError, SwiftbotError, UnreachableError
+from appliance.errors import ConfigError, PayloadError, SwiftbotError
 from appliance.model import ErrorReply, encode
-from appliance.plane import link
 from appliance.plane.asking import Question
-from appliance.plane.session import Answer, Session, Way
+from appliance.plane.session import Session
 
 Q = TypeVar("Q", bound=Struct)
 R = TypeVar("R", bound=Struct)
-
-AtOnce = Callable[[Struct | SwiftbotError], None]
-"""Answers a direct call, from any thread."""
 
 _EXCHANGE_BYTES = 32 * 1024
 """A request or reply larger than this appears in its exchange record by size and digest only."""
@@ -83,14 +78,8 @@ class Rpc:
         handler: Callable[[Q], Awaitable[Struct]],
         *,
         exchange: bool = True,
-        direct: bool = False,
-        at_once: Callable[[Q, AtOnce], bool] | None = None,
     ) -> None:
-        """Answer a verb. `exchange=False` is for the plane's own traffic, which would repeat what is put anyway.
-
-        `direct` has small questions come as plain messages too; `at_once` is tried first for direct calls, on a thread
-        of Zenoh's (`Session.serve`); bad input is the handler's.
-        """
+        """Answer a verb. `exchange=False` is for the plane's own traffic, which would repeat what is put anyway."""
         gateway = self._gateway
         if gateway is None or self._verbs is None or verb in self._registered:
             raise ConfigError(f"the verb {verb} cannot be served here")
@@ -117,9 +106,8 @@ class Rpc:
             self._publish(verb, gateway, payload, began, reply)
             return reply
 
-        quick = None if at_once is None else partial(_at_once, msgspec.json.Decoder(request), at_once)
         self._registered.add(verb)
-        self._verbs.add(verb, lambda _, payload: serve(payload), direct=direct, at_once=quick)
+        self._verbs.add(verb, lambda _, payload: serve(payload))
 
     def _publish(self, verb: str, gateway: str, payload: bytes, began: float, outcome: bytes | Exception) -> None:
         reply, error = (outcome, None) if isinstance(outcome, bytes) else (None, _failure(outcome))
@@ -154,42 +142,6 @@ class Rpc:
         question = self._session.ask(key, encode(request), timeout_s=timeout_s, direct=direct)
         return Call(self._session, question, gateway, verb, reply)
 
-    def make_way(self, gateway: str, verb: str) -> None:
-        """Have the way to a gateway's verbs ready before the first question; on the event loop's thread."""
-        self._session.make_way(self._session.keys.rpc(gateway, verb))
-
-    def known_way(self, gateway: str, verb: str) -> Way | None:
-        """The way to a gateway's verb for `ask_here`, where it is known that somebody listens; from any thread."""
-        return self._session.known_way(self._session.keys.rpc(gateway, verb))
-
-    def ask_here(
-        self, way: Way, gateway: str, verb: str, payload: bytes, on_reply: Callable[[bytes | SwiftbotError], None]
-    ) -> int | None:
-        """Ask a gateway from any thread, without waiting.
-
-        The answer as it came, or why there is none, comes on a thread of Zenoh's.
-
-        Returns:
-            The question's number, to be forgotten (`forget`) where the answer is not waited for any more; None: it was
-            not sent. An answer that is empty is too large for a message: ask again (`begin`).
-        """
-
-        def reply(data: bytes | None, error: SwiftbotError | None) -> None:
-            on_reply(data if data is not None else error or SwiftbotError("no answer"))
-
-        def gone() -> None:
-            on_reply(UnreachableError("whoever was asked went away", remedy=link.NOBODY_REMEDY, sent=True))
-
-        return self._session.ask_here(way, self._session.keys.rpc(gateway, verb), payload, reply, gone)
-
-    def forget(self, number: int) -> None:
-        """Wait no more for the answer to what was asked with `ask_here`; from any thread."""
-        self._session.forget(number)
-
-    def decode(self, gateway: str, verb: str, answer: bytes, reply: type[R]) -> R:
-        """Read an answer to `ask_here`; PayloadError, counted, when it is no `reply`."""
-        return _decoded(self._session, gateway, verb, answer, reply)
-
     def close(self) -> None:
         """Answer no more."""
         if self._verbs is not None:
@@ -202,23 +154,6 @@ def _decoded(session: Session, gateway: str, verb: str, answer: bytes, reply: ty
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         session.refuse(f"malformed answer {verb}", key=session.keys.rpc(gateway, verb), reason=str(error))
         raise PayloadError(f"{gateway} answered {verb} with no {reply.__name__}: {error}") from error
-
-
-def _at_once(
-    decoder: msgspec.json.Decoder[Q], handler: Callable[[Q, AtOnce], bool], payload: bytes, answer: Answer
-) -> bool:
-    """Decode and answer on the thread that is here; False: the handler on the event loop has to."""
-
-    def tell(outcome: Struct | SwiftbotError) -> None:
-        if isinstance(outcome, SwiftbotError):
-            answer(None, outcome)
-        else:
-            answer(encode(outcome), None)
-
-    try:
-        return handler(decoder.decode(payload), tell)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, SwiftbotError):
-        return False  # it will be refused there, and counted
 
 
 def _failure(error: Exception) -> ErrorReply:

@@ -5,8 +5,8 @@ bounded, and one that is malformed or oversize is counted, logged and dropped or
 Nothing that is sent can hang the loop: sends block when a peer is stuck (dropping would lose facts silently), but
 they do so on a thread of their own, and a peer stuck for a lease is disconnected.
 
-Its parts are `publishing` (facts), `answering` and `asking` (questions), `direct` (small ones, as plain messages),
-`presence` (liveliness tokens) and `doors` (links that are mixed up), each around the same `wire`.
+Its parts are `publishing` (facts), `answering` and `asking` (questions), `presence` (liveliness tokens) and `doors`
+(links that are mixed up), each around the same `wire`.
 """
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
@@ -19,7 +19,6 @@ import zenoh
 from appliance.plane import link
 from appliance.plane.answering import Answering
 from appliance.plane.asking import Asking
-from appliance.plane.direct import Answer, Direct, Way
 from appliance.plane.doors import Doors
 from appliance.plane.keys import Keys
 from appliance.plane.presence import Presence
@@ -29,7 +28,7 @@ from appliance.plane.sockets import SocketWatch
 from appliance.plane.verbs import Verbs
 from appliance.plane.wire import Closer, Wire
 
-__all__ = ["Answer", "Closer", "Message", "Session", "Way"]
+__all__ = ["Closer", "Message", "Session"]
 
 _CLOSE_S = 2.0
 """How long a closing session keeps sending what waits."""
@@ -48,10 +47,8 @@ class Session:
         self._wire = wire
         self._sockets = SocketWatch.shared(config.lease_ms)
         doors = Doors(wire, self._sockets)
-        presence = Presence(wire)
-        direct = Direct(wire)
-        self._answering, self._asking = Answering(wire, doors, direct), Asking(wire, doors, direct)
-        publishing = Publishing(wire, self._serve_backlog)
+        publishing, presence = Publishing(wire, self._serve_backlog), Presence(wire)
+        self._answering, self._asking = Answering(wire, doors), Asking(wire, doors)
         self.put = publishing.put
         self.delete = publishing.delete
         self.flood = publishing.flood
@@ -63,8 +60,6 @@ class Session:
         self.ask = self._asking.ask
         self.query_all = self._asking.query_all
         self.answerers = self._asking.answerers
-        self.make_way, self.known_way = direct.make_way, direct.known_way
-        self.ask_here, self.forget = direct.ask_here, direct.forget
         self.declare_alive = presence.declare_alive
         self.alive_now = presence.alive_now
         self.watch_alive = presence.watch_alive

@@ -33,13 +33,8 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     virtual_nodes: int = 32
     """Points of each gateway on the ring: shares within about 20 % of each other, and still cheap to compute."""
     voters: tuple[str, ...] = ()
-    """Gateways that vote on reads and writes with a quorum, the same list everywhere; empty: nobody may ask for one.
+    """Gateways that grant leases by majority, the same list everywhere; empty: there are no leases.
     Named and not learned: two parts of a fleet that do not see each other must agree on what a majority is."""
-    view: Literal["full"] | int = "full"
-    """`full`: every gateway knows every other, a lookup is one hop; right to about 1,000. A number: each knows so many
-    (4·log2 N is plenty), looks up hop by hop and has one point on the ring; the same in the whole fleet. Records work
-    so; placing of tasks and finding of containers still look among the gateways known, and whoever has a run of a task
-    stays known to its coordinator."""
     find_successors: int = 5
     """How many successors of hash(image) are asked for containers (paper: k = 5)."""
     lease_ms: int = 1000
@@ -96,11 +91,6 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 "plane.listen is set, but a client accepts no links", remedy="empty it, or set plane.mode to peer"
             )
         self._check_peers()
-        if self.view != "full" and self.view < max(16, 4 * self.replicas):
-            raise ConfigError(
-                f"plane.view is {self.view}",
-                remedy=f'"full", or at least {max(16, 4 * self.replicas)}: neighbours and fingers must fit in',
-            )
         for name in self.voters:
             try:
                 check_name(name, "gateway")

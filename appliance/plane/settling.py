@@ -55,7 +55,7 @@ class Settling:
         return known and settled.owner(key) == self._gateway
 
     def mine(self, key: str) -> bool:
-        """The same, and nobody has come back since who may know more; from any thread."""
+        """The same, and nobody has come back since who may know more."""
         if not self._compared(key):
             return False
         returned = self.returned
@@ -104,7 +104,7 @@ class Settling:
         return self._membership.ring.members <= self._ring.members
 
     async def until_met(self) -> None:
-        """Wait a moment until it has: where members of a bounded view come and go, somebody always has just come."""
+        """Wait a moment until it has: in a large fleet somebody always has just come."""
         self.on_wanted()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(RETURNED_S), self._changed:

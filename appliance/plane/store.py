@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from appliance.plane.ahead import NOTHING, Mark
 from appliance.plane.commits import Call, Commits
 from appliance.plane.rows import LeaveOut, read_digests, read_kept, read_page, read_records, read_row
 from appliance.plane.versions import Record, digest
@@ -29,7 +28,6 @@ class Store:
         self._loop = loop
         self._opened: asyncio.Future[None] = loop.create_future()
         self._commits = Commits(path, partial(self._post, self._opened, None))
-        self.wake = self._commits.wake
 
     @classmethod
     async def open(cls, path: Path) -> "Store":
@@ -60,35 +58,17 @@ class Store:
         """Keep a value; on the disk when this returns, unless not `durable`."""
         await self._execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", key, value, durable=durable)
 
-    async def alter(self, key: str, change: Callable[[bytes | None], bytes | None]) -> None:
-        """Read a value and put what `change` makes of it, with nothing in between; None: leave it.
-
-        `change` runs on the store's thread, and again if the commit it was part of fails.
-        """
-
-        def run(db: sqlite3.Connection) -> None:
-            row = db.execute("SELECT value FROM kept WHERE key = ?", (key,)).fetchone()
-            changed = change(row[0] if row else None)
-            if changed is not None:
-                db.execute("INSERT OR REPLACE INTO kept VALUES (?, ?)", (key, changed))
-
-        await self._call(run, writes=True)
-
-    async def delete(self, key: str, *, only: bytes | None = None) -> bool:
-        """Forget a key, if it is there and (`only`) has just that value; returns whether it was forgotten."""
-        where, values = ("", (key,)) if only is None else (" AND value = ?", (key, only))
-        sql = f"DELETE FROM kept WHERE key = ?{where}"  # noqa: S608 - one of two texts of ours
-        return await self._call(lambda db: db.execute(sql, values).rowcount > 0, writes=True)
+    async def delete(self, key: str) -> bool:
+        """Forget a key; returns whether it was there."""
+        return await self._call(
+            lambda db: db.execute("DELETE FROM kept WHERE key = ?", (key,)).rowcount > 0, writes=True
+        )
 
     async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
         """Return (key, value) of every key with that prefix, in order."""
         return await self._call(partial(read_kept, prefix=prefix))
 
     # --- records ----------------------------------------------------------------------------------------------
-
-    def look(self, key: str) -> tuple[bool, Record | None]:
-        """Whether a record is known without asking the disk, and it; from any thread."""
-        return self._commits.picture.look(key)
 
     async def record(self, key: str) -> Record | None:
         """Return a record, a tombstone too."""
@@ -126,9 +106,7 @@ class Store:
         Returns what it returned; nothing is written when that is None or what is stored already.
         """
         future: asyncio.Future[Record | None] = self._loop.create_future()
-        self._commits.submit(
-            _change_call(partial(self._change, key, decide), partial(self._post, future), key, durable)
-        )
+        self._commits.submit(_change_call(partial(self._change, key, decide), partial(self._post, future), durable))
         return await future
 
     def change_soon(
@@ -136,9 +114,7 @@ class Store:
     ) -> tuple[asyncio.Future[Record | None], asyncio.Future[Record | None]]:
         """Do the same; returns what was decided, as soon as it is, and the same once it is committed.
 
-        The decision is made here and now where the record's present state is known in memory and nothing is queued that
-        may change it; otherwise on the store's thread in its turn. The two fail alike; when only the second does, the
-        decision was made and the disk did not take it.
+        The two fail alike; when only the second does, the decision was made and the disk did not take it.
         """
         decided: asyncio.Future[Record | None] = self._loop.create_future()
         committed: asyncio.Future[Record | None] = self._loop.create_future()
@@ -149,98 +125,14 @@ class Store:
             self._post(decided, record, error)
             self._post(committed, record, error)
 
-        with self._commits.lock:
-            if self._decide_now(key, decide, decided, committed, durable=durable):
-                return decided, committed
-
         def run(db: sqlite3.Connection) -> Record | None:
             record = self._change(key, decide, db)
             self._post(decided, record, None)
             return record
 
-        self._commits.submit(_change_call(run, done, key, durable))
+        # In a transaction, so that it is told of before its commit: others store it meanwhile.
+        self._commits.submit(Call(run, done, writes=True, durable=durable))
         return decided, committed
-
-    def _decide_now(
-        self,
-        key: str,
-        decide: Callable[[Record | None], Record | None],
-        decided: asyncio.Future[Record | None],
-        committed: asyncio.Future[Record | None],
-        *,
-        durable: bool,
-    ) -> bool:
-        """Decide on the caller's thread, which has the lock; False where the store's thread has to."""
-        found = None if self._commits.closing else self._commits.ahead.known(key, self._commits.picture.look)
-        if found is None:
-            return False
-        try:
-            record = decide(found.record)
-        except Exception as error:  # noqa: BLE001 - a decision's own error is its caller's, whatever it is
-            if found.on_its_way:
-                return False  # whoever is told of a conflict must be able to read what it is with
-            for each in (decided, committed):
-                each.set_exception(error)
-            return True
-        if record is None or record == found.record:
-            if found.on_its_way:
-                return False  # acknowledged only with the commit of what it found done
-            for each in (decided, committed):
-                each.set_result(record)
-            return True
-        self._submit_decided(record, partial(self._post, committed), durable=durable)
-        # The store's thread wants the interpreter, and so does whoever sends the decision to others now: that first.
-        self._loop.call_soon(self.wake)
-        decided.set_result(record)
-        return True
-
-    def decide_now(
-        self,
-        key: str,
-        decide: Callable[[Record | None], Record | None],
-        done: Callable[[Record | None, Exception | None], None],
-        *,
-        durable: bool = True,
-    ) -> Record | None:
-        """Decide on the thread that calls, any, and have the store's commit it; whoever calls wakes that (`wake`).
-
-        Returns:
-            What was decided, of which `done` is told on the store's thread once it is committed; None: nothing was
-            done, since the record's present state is not known here, or it is to stay as it is.
-
-        Raises:
-            RefusedError: the store is closed, or too much waits for the disk.
-            Exception: what `decide` raises.
-        """
-        with self._commits.lock:
-            found = self._commits.ahead.known(key, self._commits.picture.look)
-            record = None if found is None else decide(found.record)
-            if found is None or record is None or record == found.record:
-                return None
-            self._submit_decided(record, done, durable=durable)
-        return record
-
-    def _submit_decided(
-        self, record: Record, done: Callable[[Record | None, Exception | None], None], *, durable: bool
-    ) -> None:
-        mark = Mark(decided=record)
-        call = Call(partial(self._commits.put, record), done, writes=True, durable=durable, mark=mark, single=True)
-        self._commits.submit(call, wake=False)
-
-    def change_then(
-        self,
-        key: str,
-        decide: Callable[[Record | None], Record | None],
-        done: Callable[[Record | None, Exception | None], None],
-        *,
-        durable: bool = True,
-    ) -> None:
-        """Do the same, from any thread; `done` is told on the store's thread, once it is committed.
-
-        Raises:
-            RefusedError: the store is closed, or too much waits for the disk.
-        """
-        self._commits.submit(_change_call(partial(self._change, key, decide), done, key, durable))
 
     def _change(
         self, key: str, decide: Callable[[Record | None], Record | None], db: sqlite3.Connection
@@ -286,7 +178,7 @@ class Store:
         def run(db: sqlite3.Connection) -> None:
             self._commits.dropped([row[0] for row in db.execute(sql, values).fetchall()])
 
-        await self._call(run, writes=True, durable=durable, mark=Mark(touches=""))
+        await self._call(run, writes=True, durable=durable)
 
     # --- the thread -------------------------------------------------------------------------------------------
 
@@ -296,12 +188,9 @@ class Store:
     async def _execute(self, sql: str, *values: Any, durable: bool = True) -> None:
         await self._call(lambda db: db.execute(sql, values) and None, writes=True, durable=durable)
 
-    async def _call(
-        self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True,
-        mark: Mark = NOTHING,
-    ) -> T:  # fmt: skip
+    async def _call(self, run: Callable[[sqlite3.Connection], T], *, writes: bool = False, durable: bool = True) -> T:
         future: asyncio.Future[Any] = self._loop.create_future()
-        self._commits.submit(Call(run, partial(self._post, future), writes, durable, mark))
+        self._commits.submit(Call(run, partial(self._post, future), writes, durable))
         return cast("T", await future)
 
     def _post(self, future: asyncio.Future[Any], result: Any, error: Exception | None) -> None:
@@ -325,10 +214,9 @@ class Store:
 def _change_call(
     run: Callable[[sqlite3.Connection], Record | None],
     done: Callable[[Any, Exception | None], None],
-    key: str,
     durable: bool,
 ) -> Call:
-    return Call(run, done, writes=True, durable=durable, mark=Mark(touches=key), single=True)
+    return Call(run, done, writes=True, durable=durable, single=True)
 
 
 def _looked_at(future: asyncio.Future[Record | None]) -> None:

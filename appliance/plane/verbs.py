@@ -10,14 +10,11 @@ the same.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
-from collections.abc import Callable
-
 import zenoh
 
 from appliance.errors import UnreachableError
-from appliance.plane import link, threads
+from appliance.plane import link
 from appliance.plane.answering import Answering, Handler, Served
-from appliance.plane.direct import Answer
 from appliance.plane.wire import Closer
 
 
@@ -33,25 +30,16 @@ class Verbs:
         self._closers: list[Closer] = []
         self._one = answering.wire.config.mode == "peer"
         if self._one:
-            queryable = answering.wire.raw.declare_queryable(expr, threads.callback(self._take), complete=True)
+            queryable = answering.wire.raw.declare_queryable(expr, link.callback(self._take), complete=True)
             self._closers.append(Closer(queryable.undeclare))
 
-    def add(
-        self,
-        verb: str,
-        handler: Handler,
-        *,
-        direct: bool = False,
-        at_once: Callable[[bytes, Answer], bool] | None = None,
-    ) -> None:
-        """Answer a verb from now on; the rest as of `Session.serve`."""
-        if not self._one:
-            expr = f"{self._prefix}{verb}"
-            self._closers.append(self._answering.serve(expr, handler, direct=direct, at_once=at_once))
-            return
-        served = self._served[verb] = Served(self._answering, f"{self._prefix}{verb}", handler, at_once=at_once)
-        if direct:
-            self._closers.append(self._answering.take_messages(served))
+    def add(self, verb: str, handler: Handler) -> None:
+        """Answer a verb from now on."""
+        expr = f"{self._prefix}{verb}"
+        if self._one:
+            self._served[verb] = Served(self._answering, expr, handler)
+        else:
+            self._closers.append(self._answering.serve(expr, handler))
 
     def _take(self, query: zenoh.Query) -> None:
         marked, meant = link.read_mark(query)

@@ -174,7 +174,7 @@ def eviction_case(weighed: Weighed, *, gateway: str) -> EvictionCase:
     )
 
 
-def evict_again(case: EvictionCase) -> tuple[str, ...] | None:
-    """Return whom the pool gives up now, worth least first; None: it finds no room."""
+def evict_again(case: EvictionCase) -> dict[str, Any]:
+    """Return whom the pool gives up now, worth least first, by the name of the case's field; none: it finds no room."""
     chosen = victims(case.idle, case.worths, slots=case.slots, memory_mb=case.memory_mb, spare={})
-    return None if chosen is None else tuple(each.id for each in chosen)
+    return {"chosen": None if chosen is None else tuple(each.id for each in chosen)}

@@ -18,14 +18,6 @@ class TaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     id: str
 
 
-class AgreeAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`agree`: an operator's word on whatever plan of a task waits; `approve` and `reject` say more."""
-
-    id: str
-    agree: bool = True
-    by: str = ""
-
-
 class TasksAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """`tasks`: how many at most, newest first. `local` asks for the records of the answering gateway's shard alone."""
 

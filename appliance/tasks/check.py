@@ -9,8 +9,9 @@ it, and a recorder may be started in the middle of a task. From the next record 
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 from msgspec import Struct
@@ -70,6 +71,31 @@ class CheckReport(Struct, frozen=True, kw_only=True):
         return not self.diverged
 
 
+class Traced(Struct, frozen=True):
+    """A decider that puts each decision with all that it rests on, so that it can be made again from that alone.
+
+    A further one needs a line in `TRACED` and a put of its `case` under `gw/{gateway}/decided/{its name}`.
+    """
+
+    case: type[Struct]
+    """The inputs, and the decision in fields of its own."""
+    again: Callable[[Any], dict[str, Any]]
+    """Decides again; returns the decision by the names of the case's fields."""
+    what: Callable[[Any], str]
+    """Which decision a case is of, for people."""
+
+
+TRACED = {
+    "placement": Traced(
+        PlacementCase, place_again, lambda case: f"gateway for {case.task} {case.subtask}, attempt {case.attempt}"
+    ),
+    "selection": Traced(
+        SelectionCase, select_again, lambda case: f"container for {case.need.image} by {case.gateway}"
+    ),
+    "eviction": Traced(EvictionCase, evict_again, lambda case: f"room for a run on {case.gateway}"),
+}  # fmt: skip
+
+
 class _Task:
     """One task while the log is read. In a partition two coordinators drive it: each has a line of its own."""
 
@@ -116,9 +142,7 @@ class Checker:
         self._kinds: dict[tuple[str, str], Callable[[LoggedMessage], None]] = {
             ("task", "transition"): self._transition,
             ("task", "record"): self._record,
-            ("decided", "placement"): self._placement,
-            ("decided", "selection"): self._selection,
-            ("decided", "eviction"): self._eviction,
+            **{("decided", name): partial(self._decided, name) for name in TRACED},
         }
 
     def take(self, message: LoggedMessage, log: str = "") -> None:
@@ -214,34 +238,16 @@ class Checker:
             self._differs("machine", message, what, before, now)
         task.remember([logged])
 
-    # --- placement, selection, eviction --------------------------------------------------------------------------
+    # --- deciders that put what they rest on --------------------------------------------------------------------
 
-    def _placement(self, message: LoggedMessage) -> None:
-        case = msgspec.json.decode(message.payload, type=PlacementCase)
-        now = place_again(case)
-        self.checked["placement"] += 1
-        if now.order != case.order or now.scores != case.scores:
-            what = f"gateway for {case.task} {case.subtask}, attempt {case.attempt}"
-            self._differs("placement", message, what, _scored(case.order, case.scores), _scored(now.order, now.scores))
-
-    def _selection(self, message: LoggedMessage) -> None:
-        case = msgspec.json.decode(message.payload, type=SelectionCase)
-        now = select_again(case)
-        self.checked["selection"] += 1
-        logged = {name: getattr(case, name) for name in now}
-        if any(_unequal(logged[name], now[name]) for name in now):
-            self._differs(
-                "selection", message, f"container for {case.need.image} by {case.gateway}", _shown(logged), _shown(now)
-            )
-
-    def _eviction(self, message: LoggedMessage) -> None:
-        case = msgspec.json.decode(message.payload, type=EvictionCase)
-        now = evict_again(case)
-        self.checked["eviction"] += 1
-        if now != case.chosen:
-            what = f"room for a run on {case.gateway}"
-            told = "no room" if now is None else ", ".join(now)
-            self._differs("eviction", message, what, ", ".join(case.chosen), told)
+    def _decided(self, name: str, message: LoggedMessage) -> None:
+        traced = TRACED[name]
+        case = msgspec.json.decode(message.payload, type=traced.case)
+        now = traced.again(case)
+        self.checked[name] += 1
+        logged = {field: getattr(case, field) for field in now}
+        if any(_unequal(logged[field], now[field]) for field in now):
+            self._differs(name, message, traced.what(case), _shown(logged), _shown(now))
 
     def _differs(self, decider: str, message: LoggedMessage, what: str, logged: str, now: str) -> None:
         self.diverged += 1
@@ -310,10 +316,19 @@ def _unequal(one: Any, other: Any) -> bool:
     return one != other
 
 
-def _scored(order: Sequence[str], scores: dict[str, float]) -> str:
-    return ", ".join(f"{name} {scores.get(name, 0.0):.3f}" for name in order) or "nobody"
-
-
 def _shown(decision: dict[str, Any]) -> str:
-    told = (f"{name} {each:.3f}" if isinstance(each, float) else f"{name} {each}" for name, each in decision.items())
-    return ", ".join(told)
+    return ", ".join(f"{name} {_told(value)}" for name, value in decision.items())
+
+
+def _told(value: Any) -> str:
+    match value:
+        case None:
+            return "nothing"
+        case float():
+            return f"{value:.3f}"
+        case tuple():
+            return ", ".join(map(str, cast("tuple[object, ...]", value))) or "nobody"
+        case dict():
+            return _shown(cast("dict[str, Any]", value))
+        case _:
+            return str(value)

@@ -5,6 +5,7 @@ are left out, since they have no part in the order; so are containers that were 
 """
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from msgspec import Struct
 
@@ -117,8 +118,8 @@ def tell(plane: Plane, case: PlacementCase | None) -> None:
         plane.session.put(plane.keys.decided(plane.gateway, "placement"), encode(case))
 
 
-def place_again(case: PlacementCase) -> Placement:
-    """Return what the placement is now."""
+def place_again(case: PlacementCase) -> dict[str, Any]:
+    """Return what the placement is now, by the names of the case's fields."""
     containers = {
         each.id: {
             str(number): ContainerInfo(
@@ -128,7 +129,7 @@ def place_again(case: PlacementCase) -> Placement:
         }
         for each in case.gateways
     }
-    return place(
+    placement = place(
         case.need,
         here=case.here,
         gateways={
@@ -148,3 +149,4 @@ def place_again(case: PlacementCase) -> Placement:
         config=TasksConfig(load_weight=case.load_weight, data_weight=case.data_weight, warm_weight=case.warm_weight),
         stale_s=case.stale_s,
     )
+    return {"order": placement.order, "scores": placement.scores}

@@ -19,7 +19,6 @@ import structlog
 from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
 from appliance.model import Failure, TaskRecord, VersionVector
 from appliance.plane.dht import Record
-from appliance.tasks import machine
 from appliance.tasks.bounds import MAX_TEXT, clean, read_record
 from appliance.tasks.deadline import Ages
 from appliance.tasks.driver import Driver
@@ -110,14 +109,13 @@ class Driving:
             self._around,
             record,
             version,
-            on_change=self._written,
+            on_change=self._moved,
             give_up=give_up,
             elapsed_s=self._ages.elapsed_s(record),
             unknown=unknown(value) if value else None,
         )
         self.drivers[record.id] = driver
         self._since[record.id] = time.monotonic()
-        self._hold(record)
         task = asyncio.create_task(driver.run(), name=f"drive {record.id}")
         self._tasks[record.id] = task
         task.add_done_callback(lambda done: self._driven(driver, done))
@@ -134,21 +132,12 @@ class Driving:
         log.info("task record has changed, its driver steps down", task=driver.record.id, state=str(driver.told.state))
         self._tasks[driver.record.id].cancel()
 
-    def _written(self, record: TaskRecord) -> None:
-        self._hold(record)
-        self._moved(record)
-
-    def _hold(self, record: TaskRecord) -> None:
-        """Whoever has a run of a task must be missed when it goes, and not sooner."""
-        self._plane.hold(task_key(record.id), frozenset(each.gateway for each in machine.active(record)) - {""})
-
     def _driven(self, driver: Driver, done: asyncio.Task[None]) -> None:
         self.drivers.pop(driver.record.id, None)
         self._ended(driver)
         self._tasks.pop(driver.record.id, None)
         task = driver.record.id
         driven_s = time.monotonic() - self._since.pop(task)
-        self._plane.hold(task_key(task), frozenset())
         if not done.cancelled() and (error := done.exception()) is not None:
             # The record stands as it was last written: a new driver takes it up from there.
             log.error("driver broke", task=task, exc_info=error)

@@ -384,7 +384,6 @@ _HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] 
     TransitionKind.NOTICED: revising.noticed,
     TransitionKind.REBOUND: revising.revised,
     TransitionKind.SUBSTITUTED: revising.revised,
-    TransitionKind.AGREED: revising.agreed,
     TransitionKind.REPLANNED: revising.revised,
     TransitionKind.REPLAN_FAILED: revising.replan_failed,
     **steering.HANDLERS,

@@ -2,7 +2,7 @@
 
 A subtask that was given up with `replan` stands as failed in a task that goes on running. What is done about it comes
 as one transition each: `rebound` (another robot), `substituted` (an alternative skill) and `replanned` (a new plan of
-the decomposer, which was `proposed` and perhaps `agreed` to before) carry the whole plan from then on, which is
+the decomposer, which was `proposed` and perhaps `approved` before) carry the whole plan from then on, which is
 checked here against what the record holds:
 
 - what has succeeded or is under way is in it, unchanged, so that nothing is done twice and no run is left behind;
@@ -116,14 +116,6 @@ def proposed(record: TaskRecord, event: Transition) -> TaskRecord:
     )
     note = "waits for an operator to agree to the new plan" if event.waits else "a new plan is there"
     return _with(replace(record, proposal=proposal), replace(target, note=note))
-
-
-def agreed(record: TaskRecord, event: Transition) -> TaskRecord:
-    """An operator has agreed: the proposal takes effect next."""
-    del event
-    if record.state is not TaskState.RUNNING or record.proposal is None or not record.proposal.waits:
-        raise StaleTransitionError(f"nothing of task {record.id} waits for an operator")
-    return replace(record, proposal=replace(record.proposal, waits=False))
 
 
 def replan_failed(record: TaskRecord, event: Transition) -> TaskRecord:

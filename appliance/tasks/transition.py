@@ -54,8 +54,6 @@ class TransitionKind(StrEnum):
     PROPOSED = "proposed"
     """A plan is there and may have to be approved (`waits`): the first one (no `subtask`), or a new one of the
     decomposer after a failure, as it gave it."""
-    AGREED = "agreed"
-    """An operator agrees to what was proposed (in logs of earlier versions)."""
     APPROVED = "approved"
     """An operator approves what was proposed (`decision`), or another plan in its place (`plan`)."""
     REJECTED = "rejected"

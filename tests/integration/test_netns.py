@@ -42,29 +42,6 @@ async def bench(*arguments: str) -> dict[str, Any]:
     return json.loads(out)
 
 
-async def test_answers_with_a_quorum_are_right_on_a_bad_network() -> None:
-    """Losses, delays, a one-way cut and a partition: histories stay linearizable, and the fleet is whole afterwards."""
-    result = await bench(
-        "history", "--gateways", "4", "--clients", "4", "--keys", "4", "--every-s", "0",
-        "--faults", "loss,delay,oneway,partition", "--fault-s", "5", "--rest-s", "3",
-    )  # fmt: skip
-    assert result["held"], result
-    assert result["frames"]["lost"] > 0
-    assert result["frames"]["delayed"] > 0
-    assert result["frames"]["cut"] > 0
-    assert result["operations"]["cas"]["ok"] > 0
-
-
-async def test_replicas_agree_after_a_partition() -> None:
-    """Without a quorum both sides write on; healed, all replicas are equal and know of every acknowledged write."""
-    result = await bench(
-        "history", "--gateways", "4", "--clients", "4", "--keys", "4", "--every-s", "0", "--no-quorum",
-        "--faults", "oneway,partition", "--fault-s", "5", "--rest-s", "3",
-    )  # fmt: skip
-    assert result["held"], result
-    assert result["frames"]["cut"] > 0
-
-
 @pytest.mark.podman
 async def test_tasks_are_not_lost_or_doubled_on_a_bad_network(built: None, tmp_path: Path) -> None:
     """Losses, a one-way cut and a partition while tasks run: all succeed, and each effect is there once.

@@ -10,18 +10,19 @@ import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 from fleets import RULES
 from moving_bench import counting, ended, pretty, write_skills
 from msgspec.structs import replace
+from relays import Relay, router
 
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
 from appliance.model import Approval, Notice, TaskRecord, TaskState
-from appliance.plane.router import run_router
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
@@ -35,48 +36,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.m
 LEASE_MS = 5000
 """A loaded machine keeps processes waiting for seconds; the cut itself breaks the links, which is seen at once."""
 NAMES = ("gw-1", "gw-2", "gw-3", "gw-4")
-
-
-class Relay:
-    """Passes bytes between whoever connects and a port, until it is cut; then nothing, until it is mended."""
-
-    def __init__(self, port: int, to: int) -> None:
-        self._port, self._to = port, to
-        self._server: asyncio.Server | None = None
-        self._links: set[asyncio.StreamWriter] = set()
-
-    async def mend(self) -> None:
-        """Listen."""
-        self._server = await asyncio.start_server(self._link, "127.0.0.1", self._port)
-
-    async def cut(self) -> None:
-        """Break all links and take no new ones."""
-        if self._server is not None:
-            self._server.close()
-            for writer in self._links:
-                writer.transport.abort()
-            await self._server.wait_closed()
-            self._server = None
-
-    async def _link(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            other_reader, other_writer = await asyncio.open_connection("127.0.0.1", self._to)
-        except OSError:
-            writer.close()
-            return
-        self._links |= {writer, other_writer}
-        try:
-            await asyncio.gather(self._pass(reader, other_writer), self._pass(other_reader, writer))
-        finally:
-            self._links -= {writer, other_writer}
-
-    @staticmethod
-    async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(OSError):
-            while data := await reader.read(65536):
-                writer.write(data)
-                await writer.drain()
-        writer.close()
 
 
 @asynccontextmanager
@@ -100,20 +59,6 @@ async def process(folder: Path, name: str, *arguments: str) -> AsyncIterator[asy
 
 
 @asynccontextmanager
-async def router(listen: str, *connect: str) -> AsyncIterator[None]:
-    """A router in this process."""
-    stop, opened = asyncio.Event(), asyncio.get_running_loop().create_future()
-    config = PlaneConfig(mode="router", listen=(listen,), connect=connect, lease_ms=LEASE_MS)
-    running = asyncio.create_task(run_router(config, stop=stop, ready=opened.set_result, alive=lambda: None))
-    try:
-        await opened
-        yield
-    finally:
-        stop.set()
-        await running
-
-
-@asynccontextmanager
 async def halves(folder: Path) -> AsyncIterator[tuple[Relay, FleetClient, FleetClient]]:
     """Two gateways at each of two routers; a client at each router."""
     fleet = f"p{os.getpid()}-{time.monotonic_ns() % 100000}"
@@ -121,12 +66,12 @@ async def halves(folder: Path) -> AsyncIterator[tuple[Relay, FleetClient, FleetC
     relay = Relay(between, one)
     skills = write_skills(folder)
     async with contextlib.AsyncExitStack() as stack:
-        stack.push_async_callback(remove_fleet, fleet)
+        stack.push_async_callback(partial(remove_fleet, fleet, volumes=True))
         await relay.mend()
         stack.push_async_callback(relay.cut)
         ends = [f"tcp/127.0.0.1:{port}" for port in (one, other)]
-        await stack.enter_async_context(router(ends[0]))
-        await stack.enter_async_context(router(ends[1], f"tcp/127.0.0.1:{between}"))
+        await stack.enter_async_context(router(ends[0], lease_ms=LEASE_MS))
+        await stack.enter_async_context(router(ends[1], f"tcp/127.0.0.1:{between}", lease_ms=LEASE_MS))
         for number, name in enumerate(NAMES):
             config = GatewayConfig(
                 id=name,

@@ -106,7 +106,6 @@ async def test_an_owner_whose_disk_fails_keeps_nobody_from_the_other_copies(
     async def broken(_: str) -> None:
         raise PrerequisiteError("the disk fails")
 
-    monkeypatch.setattr(planes[1].store, "look", lambda _: (False, None))
     monkeypatch.setattr(planes[1].store, "record", broken)
     found = await planes[asker].dht.read(key)
     assert found is not None

@@ -22,14 +22,14 @@ pytestmark = pytest.mark.anyio
 
 @contextlib.asynccontextmanager
 async def _fleet(folder: Path, ports: list[int]) -> AsyncIterator[list[Plane]]:
-    """Gateways that are all voters and have reconciled."""
+    """Gateways that have reconciled."""
     endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
     names = tuple(f"g{number}" for number in range(len(ports)))
     planes: list[Plane] = []
     async with contextlib.AsyncExitStack() as stack:
         for name, endpoint in zip(names, endpoints, strict=True):
             peers = dict(zip(names, endpoints, strict=True))
-            config = PlaneConfig(listen=(endpoint,), peers=peers, voters=names)
+            config = PlaneConfig(listen=(endpoint,), peers=peers)
             planes.append(await Plane.open(config, fleet="browse", gateway=name, data_dir=folder / name))
             stack.push_async_callback(planes[-1].close)
         while not all(len(each.members()) == len(planes) and each.dht.settling.reconciled() for each in planes):
@@ -57,13 +57,11 @@ async def test_records_are_read_listed_and_changed(tmp_path: Path, free_ports: C
                 assert (await records.read("note/1", how)).value == b"one"  # type: ignore[arg-type]
             with pytest.raises(ConflictError):
                 await records.write("note/1", b"two", expected=None)
-            voted = await records.write("lock/1", b"mine", expected=None, quorum=True)
-            assert (await records.read("lock/1", "quorum")).value == b"mine"
+            mine = await records.write("lock/1", b"mine", expected=None)
             place = await records.place("note/1")
             assert place.agree
             assert place.replicas == planes[0].ring.successors("note/1", 3)
             assert place.owner == place.replicas[0]
-            assert len(place.voters) == 3
             assert all(each.version == version and each.size_bytes == 3 for each in place.copies)
             await records.write("note/2", b"zwei", expected=None)
             held, failed = await records.held("note/", 10)
@@ -80,9 +78,9 @@ async def test_records_are_read_listed_and_changed(tmp_path: Path, free_ports: C
                 await records.write("task/1", b"", expected=None)
             with pytest.raises(PayloadError):
                 await records.read("")
-            await records.remove("lock/1", expected=voted, quorum=True)
+            await records.remove("lock/1", expected=mine)
             with pytest.raises(NotFoundError):
-                await records.read("lock/1", "quorum")
+                await records.read("lock/1")
 
 
 async def test_a_replica_is_read_where_it_is_asked_for(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
@@ -119,17 +117,17 @@ async def test_the_commands(tmp_path: Path, free_ports: Callable[..., list[int]]
         assert b"[bold]" in out
         assert b"the copies agree" in out
         assert (await _swiftbot(endpoint, "put", "note/1", "x", "--new"))[0] == 4
-        code, out = await _swiftbot(endpoint, "put", "lock/1", '{"by": 1}', "--quorum", "--json")
+        code, out = await _swiftbot(endpoint, "put", "lock/1", '{"by": 1}', "--json")
         version = json.loads(out)["version"]
         assert code == 0
-        code, out = await _swiftbot(endpoint, "get", "lock/1", "--quorum", "--json")
+        code, out = await _swiftbot(endpoint, "get", "lock/1", "--json")
         told = json.loads(out)
         assert (told["value"], told["version"], told["agree"]) == ({"by": 1}, version, True)
         assert {each["gateway"] for each in told["place"]["copies"]} == {"g0", "g1", "g2"}
         code, out = await _swiftbot(endpoint, "ls", "--json")
         assert [each["key"] for each in json.loads(out)] == ["lock/1", "note/1"]
-        code, out = await _swiftbot(endpoint, "rm", "lock/1", "--quorum", "--expect", json.dumps(version))
+        code, out = await _swiftbot(endpoint, "rm", "lock/1", "--expect", json.dumps(version))
         assert code == 0
-        assert (await _swiftbot(endpoint, "get", "lock/1", "--quorum"))[0] == 4
+        assert (await _swiftbot(endpoint, "get", "lock/1"))[0] == 4
         code, out = await _swiftbot(endpoint, "ls", "--removed")
         assert b"removed" in out

@@ -76,7 +76,6 @@ async def test_a_write_that_a_later_one_overtakes_is_done(fleet: Fleet, monkeypa
         return Late(gateway, record) if record.value == b"first" else begin(gateway, record, durable=durable)
 
     monkeypatch.setattr(owner.dht._pushing, "begin", push)
-    monkeypatch.setattr(owner.rpc, "known_way", lambda *_: None)  # none is ordered in place
     writing = asyncio.create_task(owner.dht.write(key, b"first", expected=None))
     while (first := await fleet.planes[0].dht.read(key)) is None:
         await asyncio.sleep(0.01)
@@ -195,12 +194,13 @@ async def test_malformed_and_oversize_input_on_every_verb(fleet: Fleet) -> None:
     foreign = await Session.open(PlaneConfig(mode="client", connect=(fleet.endpoints[0],)), "f")
     verbs = sorted(plane.rpc._registered)
     impossible = {
-        "quorum_accept": [{"key": "", "ballot": [1, "a"], "record": {"key": ""}, "voters": ""}],
-        "quorum_prepare": [{"key": "", "ballot": [1, "a"], "voters": ""}],
-        "quorum_settle": [{"key": ""}],
-        "quorum_vote": [{"key": "", "voters": ""}],
-        "quorum_write": [{"key": "", "value": ""}, {"key": "k", "value": "&"}],
-        "record_read": [{"key": ""}, {"key": "", "quorum": True}],
+        "lease_grant": [
+            {"key": "k", "holder": "", "fence": 1, "ttl_s": 1, "voters": ""},
+            {"key": "k", "holder": "h", "fence": 0, "ttl_s": 1, "voters": ""},
+            {"key": "k", "holder": "h", "fence": 1, "ttl_s": 31, "voters": ""},
+        ],
+        "lease_release": [{"key": "k", "holder": "h", "fence": 0, "voters": ""}],
+        "record_read": [{"key": ""}],
         "record_write": [{"key": "", "value": ""}, {"key": "k", "expected": {"g": 0}}],
         "dht_read": [{"key": ""}],
         "dht_write": [{"key": "", "value": ""}, {"key": "k", "expected": {"g": 0}}, {"key": "k", "value": "&"}],

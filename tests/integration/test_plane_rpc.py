@@ -185,10 +185,10 @@ async def test_a_verb_that_was_meant_for_another_key_is_refused(pair: tuple[Sess
 
 
 async def test_whoever_serves_no_more_is_as_if_it_was_not_there(pair: tuple[Session, Session]) -> None:
-    """Its verbs are gone with it, those that come as plain messages too; another may serve them then."""
+    """Its verbs are gone with it, however they are asked; another may serve them then."""
     one, other = pair
     server, caller = Rpc(other, "b"), Rpc(one, "a")
-    server.register("need", Need, _echo, direct=True)
+    server.register("need", Need, _echo)
     await heard(one, other)
     for direct in (False, True):
         assert await caller.call("b", "need", Need(image="x"), Need, direct=direct) == Need(image="x")
@@ -198,7 +198,7 @@ async def test_whoever_serves_no_more_is_as_if_it_was_not_there(pair: tuple[Sess
         with pytest.raises(UnreachableError) as nobody:
             await caller.call("b", "need", Need(image="x"), Need, direct=direct)
         assert not nobody.value.sent
-    Rpc(other, "b").register("need", Need, _echo, direct=True)
+    Rpc(other, "b").register("need", Need, _echo)
     await heard(one, other)
     for direct in (False, True):
         assert await caller.call("b", "need", Need(image="x"), Need, direct=direct) == Need(image="x")

@@ -61,7 +61,7 @@ def test_revisions_are_in_the_log_as_transitions_of_their_own() -> None:
     for message in read(LOGS / "replanned.mcap"):
         if message.key.endswith("/transition"):
             kinds[msgspec.json.decode(message.payload)["kind"]] += 1
-    expected = {"substituted": 1, "proposed": 2, "agreed": 1, "replanned": 1, "replan failed": 1}
+    expected = {"substituted": 1, "proposed": 2, "approved": 1, "replanned": 1, "replan failed": 1}
     assert {kind: kinds[kind] for kind in expected} == expected
     assert kinds["noticed"] >= 1
 

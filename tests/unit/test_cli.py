@@ -8,7 +8,7 @@ from appliance import cli
 
 COMMANDS = [
     "up", "down", "demo", "gateway", "record", "plan", "submit", "task list", "task show", "task cancel", "task watch",
-    "task why", "task agree", "fleet",
+    "task why", "fleet",
     "pool", "robots list", "robots qgc-actions", "log info", "log replay", "log recover",
     "log merge", "log trim", "log cat", "log pin", "log check", "log trigger",
     "sim mavlink", "sim zenoh", "images build", "images list",
@@ -47,7 +47,6 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         (["log", "info", "{tmp}/none.mcap"], 4, "none.mcap"),
         (["log", "replay", "{tmp}/none.mcap"], 4, "none.mcap"),
         (["gateway", "--config", "{tmp}/none.toml"], 2, "none.toml"),
-        (["plane", "get", "k", "--quorum", "--replica"], 2, "exclude"),
         (["plane", "put", "k", "v", "--new", "--expect", "{{}}"], 2, "exclude"),
         (["plane", "put", "k", "v", "--stdin"], 2, "leave all but one out"),
         (["plane", "put", "k", "--file", "{tmp}/none"], 4, "none"),

@@ -19,7 +19,7 @@ import uvloop
 import zenoh
 
 from appliance.bench.dht.node import tell
-from appliance.plane import link, threads
+from appliance.plane import link
 from appliance.plane.settings import PlaneConfig
 from appliance.ports import free_port
 
@@ -47,7 +47,7 @@ async def _ask(session: zenoh.Session, key: str, payload: bytes) -> None:
 
     session.get(
         key,
-        threads.callback(take),
+        link.callback(take),
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=ANSWER_S,
         congestion_control=zenoh.CongestionControl.DROP,
@@ -70,7 +70,7 @@ async def serve(nodes: int) -> None:
     answering = [
         each.declare_queryable(
             f"bare/{number}",
-            threads.callback(partial(_answer, f"bare/{number}")),
+            link.callback(partial(_answer, f"bare/{number}")),
             complete=True,
         )
         for number, each in enumerate(sessions)

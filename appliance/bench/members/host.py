@@ -8,15 +8,14 @@ JSON; times are those of the machine's monotonic clock, so that processes' times
 import asyncio
 import gc
 import json
-import math
 import os
 import random
 import resource
 import sys
 import time
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import uvloop
@@ -26,7 +25,6 @@ from appliance import logs
 from appliance.errors import SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus
 from appliance.plane.node import Plane
-from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 
 STATUS_S = 2.0
@@ -43,7 +41,6 @@ class HostOptions(Struct, frozen=True, kw_only=True):
     folder: str
     connect: tuple[str, ...]
     lease_ms: int
-    view: Literal["full"] | int
 
 
 class Host:
@@ -74,7 +71,7 @@ class Host:
         options, opened = self._options, dict[str, dict[str, float]]()
         for name in ask["names"]:
             config = PlaneConfig(
-                mode="client", connect=options.connect, lease_ms=options.lease_ms, view=options.view,
+                mode="client", connect=options.connect, lease_ms=options.lease_ms,
                 connect_timeout_s=20.0,
             )  # fmt: skip
             began = time.monotonic()
@@ -131,74 +128,41 @@ class Host:
             await asyncio.sleep(STATUS_S)
 
     async def _settled(self, ask: dict[str, Any]) -> dict[str, float]:
-        """Wait until every member here knows all the others it should, and has reconciled; answers since when.
-
-        `names` are all members. With a bounded view each is to know those that stand next to it on the true ring, so
-        many `after` it and `before` it, and the facts of all that it knows; else all. A bounded view goes on taking
-        better members for those it has, for minutes after the last has come: where `behind_s` is given a member may be
-        so long behind with the facts and records of those it has just met.
-        """
-        behind_s, until = float(ask["behind_s"]), time.monotonic() + float(ask["within_s"])
-        wanted = _wanted(ask["names"], self._planes, ask.get("after", 0), ask.get("before", 0))
+        """Wait until every member here knows all the others, and has reconciled; answers since when."""
+        wanted, until = frozenset(ask["names"]), time.monotonic() + float(ask["within_s"])
         since: dict[str, float] = {}
-        last: dict[str, float] = {}
         while True:
             now = time.monotonic()
             for name, plane in self._planes.items():
                 members = plane.members()
-                known = wanted[name] <= members <= plane.registry.gateways.keys()
+                known = wanted <= members <= plane.registry.gateways.keys()
                 if known and plane.dht.settling.reconciled():
                     since.setdefault(name, now)
-                    last[name] = now
-                elif now - last.get(name, -math.inf) > behind_s:
+                else:
                     since.pop(name, None)
             if len(since) == len(self._planes):
                 return since
             if now > until:
-                behind = [_lacking(plane, wanted[name]) for name, plane in self._planes.items() if name not in since]
+                behind = [_lacking(plane, wanted) for name, plane in self._planes.items() if name not in since]
                 raise SwiftbotError(f"{len(behind)} of {len(self._planes)} are not settled: {'; '.join(behind[:5])}")
             await asyncio.sleep(_LOOK_S)
 
     async def _until_came(self, ask: dict[str, Any]) -> dict[str, Any]:
-        """Wait until every member here knows another and its status; with a key of its: finds it as the owner."""
-        member, key = ask["member"], ask.get("key", "")
-        if key:
-            found = await asyncio.gather(*(self._finds(plane, key, member) for plane in self._planes.values()))
-            return {"seen": found, "told": []}
+        """Wait until every member here knows another and its status."""
+        member = ask["member"]
         self._awaited, wanted = {member}, len(self._planes)
         while min(len(self._came.get(member, ())), len(self._told.get(member, ()))) < wanted:  # noqa: ASYNC110 - of many
             await asyncio.sleep(_LOOK_S)
         return {"seen": list(self._came[member].values()), "told": list(self._told[member].values())}
 
-    async def _finds(self, plane: Plane, key: str, member: str) -> float:
-        while True:
-            try:
-                if (await plane.holders(key, 1))[0] == member:
-                    return time.monotonic()
-            except SwiftbotError:
-                pass
-            await asyncio.sleep(_LOOK_S)
-
     async def _until_went(self, ask: dict[str, Any]) -> dict[str, Any]:
-        """Wait until no member here knows another, nor finds it as the owner of a key."""
-        member, key = ask["member"], ask.get("key", "")
+        """Wait until no member here knows another."""
+        member = ask["member"]
         while any(member in plane.members() for plane in self._planes.values()):  # noqa: ASYNC110 - of many
             await asyncio.sleep(_LOOK_S)
         for listed in (self._came, self._told):
             listed.pop(member, None)
-        seen = list(self._went.pop(member, {}).values())
-        if not key:
-            return {"seen": seen}
-        return {"seen": await asyncio.gather(*(self._finds_not(plane, key, member) for plane in self._planes.values()))}
-
-    async def _finds_not(self, plane: Plane, key: str, member: str) -> float:
-        while True:
-            try:
-                if (await plane.holders(key, 1))[0] != member:
-                    return time.monotonic()
-            except SwiftbotError:
-                pass
-            await asyncio.sleep(_LOOK_S)
+        return {"seen": list(self._went.pop(member, {}).values())}
 
     async def _write(self, ask: dict[str, Any]) -> list[float]:
         """Write these keys through members at random, one after the other; ms each."""
@@ -249,18 +213,6 @@ def _lacking(plane: Plane, wanted: frozenset[str]) -> str:
         f"{plane.gateway} does not see {len(unknown)} ({', '.join(unknown[:5])}), has no facts of {len(untold)} "
         f"({', '.join(untold[:5])}), {compared}"
     )
-
-
-def _wanted(names: Sequence[str], here: Collection[str], after: int, before: int) -> dict[str, frozenset[str]]:
-    """Whom each of those that are `here` should know: its neighbours on the true ring; all, if no number is given."""
-    if not after:
-        return dict.fromkeys(here, frozenset(names))
-    line = Ring(names, virtual_nodes=1).names
-    return {
-        name: frozenset(line[(place + step) % len(line)] for step in range(-before, after + 1))
-        for place, name in enumerate(line)
-        if name in here
-    }
 
 
 async def _serve(options: HostOptions) -> None:

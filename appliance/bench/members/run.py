@@ -7,7 +7,6 @@ killed with SIGKILL. Times are told by the members themselves, on the machine's 
 import asyncio
 import contextlib
 import json
-import math
 import secrets
 import signal
 import sys
@@ -15,7 +14,7 @@ import tempfile
 import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import psutil
@@ -24,9 +23,6 @@ from msgspec import Struct
 from appliance.bench.figures import summary
 from appliance.bench.members.host import HostOptions
 from appliance.errors import DeadlineError, SwiftbotError
-from appliance.plane.overlay.view import bound_for
-from appliance.plane.ring import Ring
-from appliance.plane.settings import PlaneConfig
 from appliance.ports import free_port
 
 Progress = Callable[[str], None]
@@ -35,8 +31,6 @@ PATIENCE_S = 300.0
 SETTLE_S = 240.0
 """For all to know each other: less, so that whoever is late can say what it lacks."""
 END_S = 10.0
-_BEHIND_S = 2.0
-"""How long a member with a bounded view may be behind with what those tell whom it has just met."""
 
 
 class Options(Struct, frozen=True, kw_only=True):
@@ -44,7 +38,6 @@ class Options(Struct, frozen=True, kw_only=True):
 
     members: int = 300
     per_process: int = 50
-    views: tuple[Literal["full", "bounded"], ...] = ("full", "bounded")
     rounds: int = 5
     """Newcomers, each killed again."""
     count: int = 500
@@ -136,22 +129,12 @@ async def side(name: str, *command: str, ready: bool = True) -> AsyncGenerator[S
 
 
 async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
-    """Measure each view in turn, with a router and hosts of its own.
+    """Measure a fleet of members, with a router and hosts of its own.
 
     Returns:
-        For each view: memory and idle CPU of a member and of the router, and the times of joining, of forgetting, of
-        reads and of writes.
+        Memory and idle CPU of a member and of the router, and the times of joining, of forgetting, of reads and of
+        writes.
     """
-    result: dict[str, Any] = {
-        "members": options.members, "members_per_process": options.per_process, "lease_ms": options.lease_ms,
-    }  # fmt: skip
-    for view in options.views:
-        result[view] = await _measure(options, view, progress)
-    return result
-
-
-async def _measure(options: Options, view: Literal["full", "bounded"], progress: Progress) -> dict[str, Any]:
-    bound = bound_for(options.members)
     names = [f"m{number:04d}" for number in range(options.members)]
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="swiftbot-bench-"))
@@ -162,7 +145,6 @@ async def _measure(options: Options, view: Literal["full", "bounded"], progress:
         )
         host_options = HostOptions(
             fleet=f"bench-{secrets.token_hex(4)}", folder=folder, connect=(endpoint,), lease_ms=options.lease_ms,
-            view="full" if view == "full" else bound,
         )  # fmt: skip
 
         def host(name: str) -> contextlib.AbstractAsyncContextManager[Side]:
@@ -170,11 +152,12 @@ async def _measure(options: Options, view: Literal["full", "bounded"], progress:
 
         shares = [names[at : at + options.per_process] for at in range(0, len(names), options.per_process)]
         hosts: list[Side] = []
-        progress(f"{view} view: {options.members} members in {len(shares)} processes")
+        progress(f"{options.members} members in {len(shares)} processes")
         for number, share in enumerate(shares):
             hosts.append(await stack.enter_async_context(host(f"host {number + 1} with {share[0]} to {share[-1]}")))
         fleet = Fleet(options, hosts, router, host, names, progress)
-        return await fleet.measure(bound if view == "bounded" else 0)
+        of = {"members": options.members, "members_per_process": options.per_process, "lease_ms": options.lease_ms}
+        return of | await fleet.measure()
 
 
 class Fleet:
@@ -196,8 +179,8 @@ class Fleet:
         self._names = names
         self._progress = progress
 
-    async def measure(self, bound: int) -> dict[str, Any]:
-        """All figures of this fleet; `bound` of the view, 0: full."""
+    async def measure(self) -> dict[str, Any]:
+        """All figures of this fleet."""
         options, result = self._options, dict[str, Any]()
         empty_mb = sum(each.rss_mb() for each in self._hosts)
         result["router_alone_mb"] = round(self._router.rss_mb(), 1)
@@ -205,20 +188,13 @@ class Fleet:
         await self._open()
         opened = time.monotonic()
         self._progress(f"all are open after {opened - began:.1f} s, now they get to know each other")
-        if bound:
-            # What lookups and copies rest on: who stands next to it, one more than hold its records before it.
-            size = len(self._names)
-            after, before = math.ceil(math.log2(max(2, size))), PlaneConfig().replicas + 1
-            near = {"after": after, "before": before, "behind_s": _BEHIND_S}
-        else:
-            near = {"behind_s": 0.0}
-        await self._all("settled", names=self._names, within_s=SETTLE_S, **near)
+        await self._all("settled", names=self._names, within_s=SETTLE_S)
         result["open_s"], result["all_know_all_s"] = round(opened - began, 2), round(time.monotonic() - began, 2)
         self._progress(f"all know all after {result['all_know_all_s']} s; idle for {options.idle_s:g} s")
         result |= await self._idle(empty_mb)
         self._progress(f"{options.count} records")
         result |= await self._records()
-        result |= await self._newcomers(by_lookup=bool(bound))
+        result |= await self._newcomers()
         refused = [(await each.ask("usage"))["refused"] for each in self._hosts]
         result["refused"] = {what: count for each in refused for what, count in each.items()}
         return result
@@ -267,9 +243,8 @@ class Fleet:
                 took[do] += await self._hosts[turn % len(self._hosts)].ask(do, keys=keys[at : at + 20])
         return {do: summary(times) for do, times in took.items()}
 
-    async def _newcomers(self, *, by_lookup: bool) -> dict[str, Any]:
+    async def _newcomers(self) -> dict[str, Any]:
         """Members that come, each in a process of its own, and are killed."""
-        points = PlaneConfig().virtual_nodes if not by_lookup else 1
         opening: list[float] = []
         joining: list[float] = []
         known: list[float] = []
@@ -278,11 +253,8 @@ class Fleet:
         alone_mb = 0.0
         for number in range(self._options.rounds):
             name = f"new{number}"
-            ring = Ring([*self._names, name], virtual_nodes=points)
-            owned = next(key for at in range(10**6) if ring.owner(key := f"key/{at}") == name)
-            key = owned if by_lookup else ""
             async with self._host(name) as newcomer:
-                waiting = asyncio.gather(*(each.ask("came", member=name, key=key) for each in self._hosts))
+                waiting = asyncio.gather(*(each.ask("came", member=name) for each in self._hosts))
                 try:
                     reached = (await newcomer.ask("open", names=[name]))[name]
                     found = await waiting
@@ -292,9 +264,8 @@ class Fleet:
                 opening.append((reached["session"] - reached["began"]) * 1e3)
                 joining.append((reached["joined"] - reached["session"]) * 1e3)
                 known.append((max(at for each in found for at in each["seen"]) - reached["session"]) * 1e3)
-                if not by_lookup:
-                    told.append((max(at for each in found for at in each["told"]) - reached["session"]) * 1e3)
-                waiting = asyncio.gather(*(each.ask("went", member=name, key=key) for each in self._hosts))
+                told.append((max(at for each in found for at in each["told"]) - reached["session"]) * 1e3)
+                waiting = asyncio.gather(*(each.ask("went", member=name) for each in self._hosts))
                 try:
                     killed = await newcomer.kill()
                     gone = await waiting
@@ -302,13 +273,11 @@ class Fleet:
                     waiting.cancel()
                 forgotten.append((max(at for each in gone for at in each["seen"]) - killed) * 1e3)
             self._progress(f"{name}: known everywhere after {known[-1]:.0f} ms, forgotten after {forgotten[-1]:.0f} ms")
-        result: dict[str, Any] = {
+        return {
             "one_member_process_mb": round(alone_mb, 1),
             "newcomer_session": summary(opening),
             "newcomer_joined": summary(joining),
             "newcomer_known_everywhere": summary(known),
+            "newcomer_facts_everywhere": summary(told),
             "killed_forgotten_everywhere": summary(forgotten),
         }
-        if told:
-            result["newcomer_facts_everywhere"] = summary(told)
-        return result

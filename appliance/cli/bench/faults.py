@@ -1,4 +1,4 @@
-"""Measurements under outages and faults of the network: tasks with counted effects, histories of records."""
+"""Measurements under outages and faults of the network: tasks with counted effects."""
 
 import sys
 
@@ -59,45 +59,6 @@ def chaos(
         gateways=gateways, tasks=tasks, seconds=minutes * 60, down_at_once=network.down_at_once, freezes=freezes,
         seed=network.seed, every_s=every_s if every_s is not None else 0.0 if named else 4.0, faults=named,
         fault_s=network.fault_s, rest_s=network.rest_s, keep=network.keep, orders=orders,
-    )  # fmt: skip
-    result = measure(run(options, progress=say))
-    tell(result, as_json=as_json)
-    return Exit.DONE if result["held"] else Exit.FAILED
-
-
-@bench_app.command
-def history(
-    *,
-    seconds: float = 60.0,
-    gateways: int = 5,
-    clients: int = 8,
-    keys: int = 6,
-    quorum: bool = True,
-    every_s: float = 3.0,
-    freezes: float = 0.4,
-    network: Network = GOOD,
-    as_json: Json = False,
-) -> int:
-    """Concurrent compare-and-sets on records while gateways are killed and stopped: was every answer right?
-
-    With a quorum the history of each key is checked for linearizability; without one, that replicas agree in the end
-    and that no acknowledged write is forgotten. Ends with 1 when it is not so; the recorded history is kept and named.
-
-    Args:
-        seconds: How long; with faults of the network their times count.
-        gateways: Gateways, each a process with nothing but its plane.
-        clients: Clients, each linked to one gateway.
-        keys: Keys they share.
-        quorum: Ask for a quorum.
-        every_s: Mean time between outages, seconds; 0 for none.
-        freezes: Share of outages in which a gateway is only stopped (SIGSTOP) for a while.
-    """
-    from appliance.bench.history.run import Options, run
-
-    options = Options(
-        seconds=seconds, gateways=gateways, clients=clients, keys=keys, quorum=quorum, every_s=every_s,
-        freezes=freezes, down_at_once=network.down_at_once, faults=_faults(network.faults), fault_s=network.fault_s,
-        rest_s=network.rest_s, seed=network.seed, keep=network.keep,
     )  # fmt: skip
     result = measure(run(options, progress=say))
     tell(result, as_json=as_json)

@@ -57,7 +57,6 @@ def members(
     *,
     members: int = 300,
     per_process: int = 50,
-    view: tuple[Literal["full", "bounded"], ...] = ("full", "bounded"),
     rounds: int = 5,
     count: int = 500,
     idle_s: float = 10.0,
@@ -72,7 +71,6 @@ def members(
     Args:
         members: How many.
         per_process: Members that share a process.
-        view: Full: each knows all; bounded: 4·log2 of their number (`plane.view`). Several one after the other.
         rounds: New members, each killed again.
         count: Records written and read.
         idle_s: How long idle CPU is taken over.
@@ -80,7 +78,7 @@ def members(
     from appliance.bench.members.run import Options, run
 
     options = Options(
-        members=members, per_process=per_process, views=view, rounds=rounds, count=count, idle_s=idle_s,
+        members=members, per_process=per_process, rounds=rounds, count=count, idle_s=idle_s,
         lease_ms=lease_ms,
     )  # fmt: skip
     tell(measure(run(options, progress=say)), as_json=as_json)

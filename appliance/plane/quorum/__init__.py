@@ -1,11 +1,14 @@
-"""Linearizable compare-and-set: a register for each key, agreed on by a majority of its voters.
+"""Leases that a majority grants: mutual exclusion for whoever must not be two, in a fleet that may be cut in two.
 
-A plain write is ordered by the key's owner, and two parts of a fleet that are cut off from each other may each have
-one. Who asks for a quorum gets a register that only one part can change: each key has r voters, chosen on the ring of
-all gateways that `plane.voters` names, whether they are there or not, and every step needs a majority of them. No
-clock and no lease has a part in it, so frozen gateways and wrong clocks cannot break it. `register` is the pure part
-(what a voter promises and accepts, what a proposer may conclude), `voting` carries it out.
+Each key has r grantors, the first on the ring of all gateways that `plane.voters` names, whether they are there or
+not; a lease needs the grant of a majority of them, and any two majorities have one in common. `grants` is the pure part
+(what a grantor grants, what an asker may conclude), `leases` the shell between gateways.
 
-Source: Rystsov, "CASPaxos: Replicated State Machines without logs", arXiv:1802.07000, 2018; single-decree Paxos of
-Lamport, "Paxos made simple", 2001, whose state is rewritten in place.
+Sources: Gray, Cheriton, "Leases: an efficient fault-tolerant mechanism for distributed file cache consistency", 1989
+(a lease ends by itself, each side by its own clock; a grantor that was restarted is silent for the longest lease);
+Lamport, "Paxos made simple", 2001 (majorities, and numbers that only increase).
 """
+
+from appliance.plane.quorum.leases import Lease, Leases
+
+__all__ = ["Lease", "Leases"]

@@ -26,7 +26,7 @@ MAX_ANSWER = 2000
 class ApproveAsk(Signed, frozen=True, kw_only=True):
     """`approve`: the plan with that hash (8 characters of it at least), or `plan` in its place.
 
-    Without a hash whatever waits is approved: for `agree`, and for programs that have just read the record.
+    Without a hash whatever waits is approved: for programs that have just read the record.
     """
 
     id: str

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from appliance.errors import ConflictError, DeadlineError, NotFoundError, UnreachableError
 from appliance.model import TaskRecord, VersionVector
 from appliance.plane.node import Plane
-from appliance.tasks.api import AgreeAsk, TaskAsk
+from appliance.tasks.api import TaskAsk
 from appliance.tasks.bounds import read_record
 from appliance.tasks.driver import Driver
 from appliance.tasks.keeper import Keeper, SupersededError
@@ -30,7 +30,7 @@ A = TypeVar("A", ApproveAsk, RejectAsk, PauseAsk, ResumeAsk, RetryAsk)
 
 
 class OperatorVerbs:
-    """The verbs `approve`, `reject`, `pause`, `resume`, `retry` and `agree` of one gateway.
+    """The verbs `approve`, `reject`, `pause`, `resume` and `retry` of one gateway.
 
     Args:
         plane: the fleet.
@@ -66,7 +66,6 @@ class OperatorVerbs:
         rpc.register("pause", PauseAsk, audit.signed("pause", self.pause))
         rpc.register("resume", ResumeAsk, audit.signed("resume", self.resume))
         rpc.register("retry", RetryAsk, audit.signed("retry", self.retry))
-        rpc.register("agree", AgreeAsk, self.agree)
         rpc.register("acts", ActsAsk, audit.acts)
 
     async def approve(self, ask: ApproveAsk) -> TaskRecord:
@@ -88,14 +87,6 @@ class OperatorVerbs:
     async def retry(self, ask: RetryAsk) -> TaskRecord:
         """Answer `retry`. Errors as `deciding.may_retry`."""
         return await self._steer("retry", ask)
-
-    async def agree(self, ask: AgreeAsk) -> TaskRecord:
-        """Answer `agree`, as `approve` or `reject` of whatever waits."""
-        if ask.agree:
-            approve = self._audit.signed("approve", self.approve)
-            return await approve(ApproveAsk(id=ask.id, by=ask.by[:120]))
-        reject = self._audit.signed("reject", self.reject)
-        return await reject(RejectAsk(id=ask.id, by=ask.by[:120]))
 
     async def _steer(self, verb: str, ask: A) -> TaskRecord:
         if ask.here or ask.id in self._drivers:

@@ -74,7 +74,6 @@ _MONITORED = frozenset(
         TransitionKind.REBOUND,
         TransitionKind.SUBSTITUTED,
         TransitionKind.PROPOSED,
-        TransitionKind.AGREED,
         TransitionKind.REPLANNED,
         TransitionKind.REPLAN_FAILED,
         TransitionKind.MOVED,

@@ -15,8 +15,8 @@ from appliance.tui.grid import Column, Grid
 from appliance.tui.keys import bindings
 from appliance.tui.logs.lines import clock
 from appliance.tui.replay.files import LogFile, find_logs
-from appliance.tui.replay.player import seconds_of, told
 from appliance.tui.replay.source import ReplayView
+from appliance.tui.replay.times import faster, rate_of, seconds_of, slower, told
 from appliance.tui.safe import safe
 from appliance.tui.store import Store
 
@@ -110,13 +110,13 @@ class ReplayScreen(FleetScreen):
             about.update(text)
 
     def _about(self, replay: ReplayView) -> Text:
-        player, now = replay.player, time.monotonic()
-        at_s, length_s = player.at_s(now), player.length_s
-        state = "… reading" if replay.reading else "▶ plays" if player.playing else "‖ paused"
+        head, now = replay.head, time.monotonic()
+        at_s, length_s = head.position_s(now), head.length_s
+        state = "… reading" if replay.reading else "‖ paused" if head.paused else "▶ plays"
         share = at_s / length_s if length_s else 1.0
         out = Text.assemble(
-            (state, "bold yellow" if player.playing else "bold"),
-            f" {told(at_s)} of {told(length_s)} · {player.rate:g}x · {clock(player.at_ns(now))}",
+            (state, "bold" if head.paused else "bold yellow"),
+            f" {told(at_s)} of {told(length_s)} · {head.rate:g}x · {clock(head.position_ns(now))}",
             f" · fleet {safe(replay.fleet, 40)}\n",
             (f"{timeline(share, max(10, self.size.width - 2))}\n", "cyan"),
             f"{safe(Path(replay.about.path).name, 80)}: {counted(replay.about.messages, 'message')} on "
@@ -149,27 +149,29 @@ class ReplayScreen(FleetScreen):
         if (replay := self._open_one()) is None:
             return
         now = time.monotonic()
-        if replay.player.playing:
-            replay.player.pause(now)
+        replay.head.position_ns(now)  # at the end it stands still
+        if replay.head.paused:
+            replay.head.play(now)
         else:
-            replay.player.play(now)
+            replay.head.pause(now, paused=True)
         self._draw_about()
 
     def do_seek(self, given: dict[str, str]) -> None:
         """Go to another moment."""
         if (replay := self._open_one()) is None:
             return
-        now = time.monotonic()
+        head, now = replay.head, time.monotonic()
         try:
-            player = replay.player
-            player.seek(seconds_of(given["time"], at_s=player.at_s(now), length_s=player.length_s), now)
+            seconds = seconds_of(given["time"], at_s=head.position_s(now), length_s=head.length_s)
+            head.seek(head.start_ns + round(seconds * 1e9), now)
         except PayloadError as error:
             self.notify(f"{safe(error.message)}\n→ {error.remedy}", severity="error", markup=False)
         self._draw_about()
 
     def _step(self, seconds: float) -> None:
         if (replay := self._open_one()) is not None:
-            replay.player.step(seconds, time.monotonic())
+            now = time.monotonic()
+            replay.head.seek(replay.head.position_ns(now) + round(seconds * 1e9), now)
             self._draw_about()
 
     def do_ahead(self, _given: object) -> None:
@@ -183,13 +185,13 @@ class ReplayScreen(FleetScreen):
     def do_faster(self, _given: object) -> None:
         """Play faster."""
         if (replay := self._open_one()) is not None:
-            replay.player.faster(time.monotonic())
+            replay.head.set_rate(faster(replay.head.rate), time.monotonic())
             self._draw_about()
 
     def do_slower(self, _given: object) -> None:
         """Play slower."""
         if (replay := self._open_one()) is not None:
-            replay.player.slower(time.monotonic())
+            replay.head.set_rate(slower(replay.head.rate), time.monotonic())
             self._draw_about()
 
     def do_rate(self, given: dict[str, str]) -> None:
@@ -197,7 +199,7 @@ class ReplayScreen(FleetScreen):
         if (replay := self._open_one()) is None:
             return
         try:
-            replay.player.set_rate(float(given["rate"].rstrip("x")), time.monotonic())
-        except (PayloadError, ValueError) as error:
-            self.notify(f"{safe(error)}\n→ give 0.1 to 100", severity="error", markup=False)
+            replay.head.set_rate(rate_of(given["rate"]), time.monotonic())
+        except PayloadError as error:
+            self.notify(f"{safe(error.message)}\n→ {error.remedy}", severity="error", markup=False)
         self._draw_about()

@@ -1,4 +1,4 @@
-"""A recorded log in place of a fleet: it fills the store as the plane does, at the moment that the player is at.
+"""A recorded log in place of a fleet: it fills the store as the plane does, at the moment that the playhead is at.
 
 Nothing can be ordered of it. Whoever was heard regularly and is heard no more (a gateway, a robot) is shown as gone,
 since presence is no message and so not in a log.
@@ -19,9 +19,9 @@ from appliance.model import TaskRecord
 from appliance.plane.session import Closer
 from appliance.record.expressions import compile_expression
 from appliance.record.facts import LoggedMessage, LogInfo
+from appliance.record.playhead import Playhead
 from appliance.tui.hearing import Hearing
 from appliance.tui.replay.cursor import Cursor, Read
-from appliance.tui.replay.player import Player
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Connection, Store
 
@@ -85,7 +85,8 @@ class ReplayView:
         self.about = cursor.about
         self.fleet = fleet_of(cursor.about)
         self.store = Store(tasks=self.config.tasks, entries=self.config.entries)
-        self.player = Player(cursor.about.start_ns, cursor.about.end_ns)
+        about = cursor.about
+        self.head = Playhead(about.start_ns, about.end_ns, rate=1.0, now=time.monotonic(), paused=True)
         self.problem = ""
         """Why it cannot be read on; empty when all is well."""
         self.reading = False
@@ -165,11 +166,11 @@ class ReplayView:
             except Exception as error:  # supervision boundary: the screen must say that nothing is read any more
                 log.exception("the log could not be read on")
                 self.problem = f"{type(error).__name__}: {error}"
-                self.player.pause(time.monotonic())
+                self.head.pause(time.monotonic(), paused=True)
             await asyncio.sleep(TICK_S)
 
     async def _feed_once(self) -> None:
-        wanted = self.player.at_ns(time.monotonic())
+        wanted = self.head.position_ns(time.monotonic())
         if wanted == self._shown_ns:
             return
         reached = self._cursor.reached_ns
@@ -183,14 +184,14 @@ class ReplayView:
             read = await asyncio.to_thread(self._cursor.on_to, wanted, most=AT_ONCE)
         await self._take(read)
         self._shown_ns = read.reached_ns
-        self.player.hold(read.reached_ns, time.monotonic())
+        self.head.hold(read.reached_ns, time.monotonic())
         self._mark_silent(read.reached_ns)
 
     async def _read_to(self, wanted: int) -> Read:
         """Read the state at a moment; while it is read another moment may be wanted, which ends this one."""
 
         def stop() -> bool:
-            return self._stopping or self.player.at_ns(time.monotonic()) < wanted
+            return self._stopping or self.head.position_ns(time.monotonic()) < wanted
 
         return await asyncio.to_thread(self._cursor.to, wanted, stop=stop)
 

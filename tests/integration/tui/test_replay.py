@@ -37,7 +37,7 @@ def replay(ann: Operator) -> ReplayView:
 
 def at_s(ann: Operator) -> float:
     """Seconds into the log."""
-    return replay(ann).player.at_s(time.monotonic())
+    return replay(ann).head.position_s(time.monotonic())
 
 
 async def test_a_recorded_log_drives_the_screens(fleet: FleetState) -> None:
@@ -79,7 +79,7 @@ async def test_a_recorded_log_drives_the_screens(fleet: FleetState) -> None:
             await ann.press("enter")
             await ann.until(lambda: at_s(ann) == 0.0 and "t-past" not in ann.store.tasks)
             await ann.press("right")
-            await ann.until(lambda: at_s(ann) == min(10.0, replay(ann).player.length_s))
+            await ann.until(lambda: at_s(ann) == min(10.0, replay(ann).head.length_s))
             await ann.press("left")
             await ann.until(lambda: at_s(ann) == 0.0)
 
@@ -95,7 +95,7 @@ async def test_a_recorded_log_drives_the_screens(fleet: FleetState) -> None:
             await ann.see("100x")
             assert at_s(ann) == stood
             await ann.press("space")
-            await ann.until(lambda: at_s(ann) == replay(ann).player.length_s and not replay(ann).player.playing)
+            await ann.until(lambda: at_s(ann) == replay(ann).head.length_s and replay(ann).head.paused)
             await ann.until(lambda: "t-past" in ann.store.tasks and ann.store.tasks["t-past"].state.final)
             await ann.line("rate 1000")
             await ann.see("0.1 to 100")

@@ -15,9 +15,9 @@ def ring(*names: str) -> Ring:
     return Ring(names, virtual_nodes=4)
 
 
-def calm(*names: str, whole: bool = True) -> Absence:
+def calm(*names: str) -> Absence:
     """What a gateway knows that has settled with these."""
-    made = Absence(replicas=3, whole=whole)
+    made = Absence(replicas=3)
     made.settled(ring(*names))
     made.calm(ring(*names), 0.0)
     return made
@@ -85,11 +85,3 @@ def test_those_that_go_one_after_the_other_leave_no_doubt() -> None:
         absence.settled(ring(*NAMES[:left]))
         assert not any(absence.doubt(key, 61.0) for key in KEYS)
         absence.calm(ring(*NAMES[:left]), 70.0)
-
-
-def test_a_bounded_view_takes_nobody_for_gone() -> None:
-    """There members leave the view as a matter of course; only silence counts."""
-    absence = calm(*NAMES, whole=False)
-    for name in NAMES[1:]:
-        absence.lost(name, 0.0)
-    assert not any(absence.doubt(key, 1.0) for key in KEYS)

@@ -4,16 +4,16 @@ import inspect
 import re
 from pathlib import Path
 
-from appliance.plane import bounded, browsing, comparing, dht, ordering, registry
+from appliance.plane import browsing, comparing, dht, ordering, registry
 from appliance.plane.keys import Keys
-from appliance.plane.quorum import voter, voting
+from appliance.plane.quorum import leases
 from appliance.plane.settings import PlaneConfig
 
 
 def test_every_key_is_described(project_root: Path) -> None:
     """Each key name that the key space can make is in the document."""
     text = (project_root / "docs" / "keyspace.md").read_text()
-    described = set(re.findall(r"`((?:gw|task|robot|world|notice|operator|recorder|@answers|@backlog)/[^`]+)`", text))
+    described = set(re.findall(r"`((?:gw|task|robot|world|notice|operator|recorder|@backlog)/[^`]+)`", text))
     described |= {f"recorder/{{recorder}}/{name}" for name in ("deleted", "log")}
     keys = Keys("f")
     for name, method in inspect.getmembers(keys, inspect.ismethod):
@@ -28,10 +28,10 @@ def test_every_verb_of_the_plane_is_described(project_root: Path) -> None:
     text = (project_root / "docs" / "keyspace.md").read_text()
     verbs = {
         verb
-        for module in (bounded, browsing, comparing, dht, ordering, registry, voter, voting)
+        for module in (browsing, comparing, dht, leases, ordering, registry)
         for verb in re.findall(r'register\("(\w+)"', inspect.getsource(module))
     }
-    assert len(verbs) == 18
+    assert len(verbs) == 12
     assert all(f"| `{verb}` |" in text for verb in verbs)
 
 

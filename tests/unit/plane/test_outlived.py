@@ -3,14 +3,12 @@
 import asyncio
 from collections.abc import Callable
 from typing import Any, cast
-from unittest.mock import MagicMock
 
 import pytest
 
 from appliance.plane.comparing import ASK_S, SEE_S
 from appliance.plane.keys import Keys
 from appliance.plane.membership import Membership
-from appliance.plane.node import Plane
 from appliance.plane.outlived import MOST_ASKED, REST_S, TRIES, Outlived
 from appliance.plane.pulse import Pulse, Standstill
 from appliance.plane.reconcile import LOSS_S
@@ -204,14 +202,6 @@ async def test_nothing_is_looked_at_after_the_end() -> None:
     await bench.outlived.close()
     await bench.stand_still(10.0, 1.1)
     assert (bench.pauses, bench.asked, bench.renewed) == ([], [], [])
-
-
-@pytest.mark.parametrize(("view", "looks"), [("full", True), (64, False)])
-async def test_only_where_all_are_known_it_is_looked_at(view: Any, looks: bool) -> None:
-    """A bounded view changes without anybody having noticed anything, and does not know since when tokens are there."""
-    plane = Plane(PlaneConfig(view=view), session=MagicMock(), store=MagicMock(), gateway="gw-1")
-    owners = [getattr(each, "__self__", None) for each in plane._pulse.on_stalled]
-    assert any(isinstance(each, Outlived) for each in owners) is looks
 
 
 async def test_it_is_not_done_again_at_once() -> None:

@@ -32,8 +32,6 @@ def test_the_defaults_are_valid() -> None:
         ),
         (PlaneConfig(mode="client", connect=("tcp/h:1",), peers={"a": "tcp/h:1"}), "plane.mode is client"),
         (PlaneConfig(mode="client", connect=("tcp/h:1",), listen=("tcp/h:2",)), "accepts no links"),
-        (PlaneConfig(view=5), "plane.view is 5"),
-        (PlaneConfig(view=16, replicas=5), "plane.view is 16"),
         (PlaneConfig(replicas=0), "plane.replicas"),
         (PlaneConfig(lease_ms=1), "plane.lease_ms"),
         (PlaneConfig(max_record_bytes=8 * 2**20), "max_record_bytes"),

@@ -223,7 +223,7 @@ async def test_a_decision_is_known_before_it_is_committed(tmp_path: Path) -> Non
     decided, committed = store.change_soon("k", lambda _: _record("k"))
     assert await decided == _record("k")
     assert await committed == _record("k")
-    assert store.look("k") == (True, _record("k"))
+    assert await store.record("k") == _record("k")
 
     def refuse(_: Record | None) -> Record:
         raise ConflictError("moved on")
@@ -235,35 +235,6 @@ async def test_a_decision_is_known_before_it_is_committed(tmp_path: Path) -> Non
     await store.close()
     with pytest.raises(RefusedError):
         store.change_soon("k", lambda _: _record("k"))
-
-
-async def test_a_decision_is_made_on_the_thread_that_asks(tmp_path: Path) -> None:
-    """`decide_now`: at once, and told of once it is committed; nothing is done where that cannot be."""
-    store = await Store.open(tmp_path / "s.sqlite")
-    told: list[tuple[Record | None, Exception | None]] = []
-
-    def note(record: Record | None, error: Exception | None) -> None:
-        told.append((record, error))
-
-    def refuse(_: Record | None) -> Record:
-        raise ConflictError("moved on")
-
-    assert store.decide_now("k", lambda _: _record("k"), note) == _record("k")
-    store.wake()
-    assert await store.record("k") in (None, _record("k"))
-    await store.change("other", lambda _: _record("other"))  # after it
-    assert told == [(_record("k"), None)]
-    assert store.decide_now("k", lambda now: now, note) is None
-    with pytest.raises(ConflictError):
-        store.decide_now("k", refuse, note)
-    turn = asyncio.create_task(store.change("k", lambda _: _record("k", b"2", 2)))
-    await asyncio.sleep(0)
-    unsure = store.decide_now("k", lambda _: _record("k", b"3", 3), note)
-    assert await turn == _record("k", b"2", 2)
-    assert unsure is None or store.look("k") == (True, unsure)
-    await store.close()
-    with pytest.raises(RefusedError):
-        store.decide_now("k", lambda _: _record("k", b"4", 4), note)
 
 
 async def test_what_a_conflict_is_with_can_be_read(tmp_path: Path) -> None:
@@ -279,77 +250,33 @@ async def test_what_a_conflict_is_with_can_be_read(tmp_path: Path) -> None:
     again, _ = store.change_soon("k", only_new)
     with pytest.raises(ConflictError):
         await again
-    assert store.look("k") == (True, _record("k"))
+    assert await store.record("k") == _record("k")
     assert await first == _record("k")
     await store.close()
 
 
 async def test_decisions_on_all_ways_follow_one_another(tmp_path: Path) -> None:
-    """Counting up by decisions made at once, in their turn and on other threads: none rests on an old state."""
+    """Counting up by decisions told of before their commit and after it: none rests on an old state."""
     store = await Store.open(tmp_path / "s.sqlite")
-    loop = asyncio.get_running_loop()
 
     def up(now: Record | None) -> Record:
         count = 1 if now is None else int(now.value) + 1
         return _record("k", str(count).encode(), count)
 
-    def elsewhere(done: asyncio.Future[None]) -> None:
-        def told(_: Record | None, error: Exception | None) -> None:
-            assert error is None
-            loop.call_soon_threadsafe(done.set_result, None)
-
-        store.change_then("k", up, told)
-
-    def at_once(done: asyncio.Future[None]) -> None:
-        def told(_: Record | None, error: Exception | None) -> None:
-            assert error is None
-            loop.call_soon_threadsafe(done.set_result, None)
-
-        if store.decide_now("k", up, told) is None:
-            store.change_then("k", up, told)
-        store.wake()
-
     waits: list[Awaitable[Any]] = []
     for number in range(120):
-        if number % 4 == 0:
+        if number % 2 == 0:
             waits += store.change_soon("k", up, durable=number % 8 == 0)
-        elif number % 4 == 1:
-            waits.append(asyncio.create_task(store.change("k", up)))
-        elif number % 4 == 2:
-            waits.append(done := loop.create_future())
-            await asyncio.to_thread(at_once, done)
         else:
-            waits.append(done := loop.create_future())
-            await asyncio.to_thread(elsewhere, done)
+            waits.append(asyncio.create_task(store.change("k", up)))
         if number % 20 == 0:
             await asyncio.sleep(0.01)
     await asyncio.gather(*waits)
     assert await store.record("k") == _record("k", b"120", 120)
     decided, committed = store.change_soon("k", up)
-    assert decided.done(), "all that it rests on is in memory"
     # The same again finds it done, and is told so only when it is on the disk.
     again, kept = store.change_soon("k", lambda now: now)
     assert (await again, await kept) == (await decided, await committed)
-    await store.close()
-
-
-async def test_any_thread_may_change_a_record(tmp_path: Path) -> None:
-    """`change_then` from other threads: each is told on the store's thread once its change is committed and shown."""
-    store = await Store.open(tmp_path / "s.sqlite")
-    loop = asyncio.get_running_loop()
-    told: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
-
-    def change(key: str) -> None:
-        def done(record: Record | None, error: Exception | None) -> None:
-            shown = error is None and store.look(key) == (True, record)
-            loop.call_soon_threadsafe(told.put_nowait, (key, shown))
-            raise RuntimeError("who waits may fail")
-
-        store.change_then(key, lambda _: _record(key), done)
-
-    await asyncio.gather(*(asyncio.to_thread(change, f"k{number}") for number in range(20)))
-    assert sorted([await told.get() for _ in range(20)]) == sorted((f"k{number}", True) for number in range(20))
-    assert await store.record("none") is None
     await store.close()
 
 
@@ -359,12 +286,12 @@ async def test_what_is_not_in_memory_is_read_from_the_file(tmp_path: Path) -> No
     await store.change("k", lambda _: _record("k"))
     await store.close()
     store = await Store.open(tmp_path / "s.sqlite")
-    assert store.look("k") == (False, None)
-    assert store.look("none") == (True, None)
+    assert store._commits.picture.look("k") == (False, None)
+    assert store._commits.picture.look("none") == (True, None)
     assert await store.record("k") == _record("k")
-    assert store.look("k") == (True, _record("k"))
+    assert store._commits.picture.look("k") == (True, _record("k"))
     await store.forget(_record("k"))
-    assert store.look("k") == (True, None)
+    assert store._commits.picture.look("k") == (True, None)
     await store.close()
 
 

@@ -260,7 +260,6 @@ class FakePlane:
         self.store = FakeStore()
         self.registry = FakeRegistry()
         self.ring = FakeRing(gateway)
-        self.held: dict[str, frozenset[str]] = {}
         self.present = {"gw-1", "gw-2", "gw-3"}
         self.on_member_lost: list[Callable[[str], None]] = []
 
@@ -271,10 +270,6 @@ class FakePlane:
     def sees(self, name: str) -> bool:
         """Whether it counts as a member."""
         return name in self.members()
-
-    def hold(self, who: str, names: frozenset[str]) -> None:
-        """Keep for whom which gateways are held."""
-        self.held = {**self.held, who: names} if names else {key: at for key, at in self.held.items() if key != who}
 
     def members(self) -> frozenset[str]:
         """Return who is there."""

@@ -19,7 +19,6 @@ from appliance.llm.safety.settings import SafetyConfig
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.model import (
     Approval,
-    Attempt,
     Decision,
     Plan,
     PoolHint,
@@ -42,7 +41,7 @@ from appliance.pool.api import Hinted
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import driving as module
 from appliance.tasks import machine
-from appliance.tasks.api import RunStatus, TaskAsk, TasksAsk, WhyAsk
+from appliance.tasks.api import TaskAsk, TasksAsk, WhyAsk
 from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
@@ -370,27 +369,6 @@ async def test_fields_of_a_newer_version_stay_whatever_is_done_with_a_task(manag
     put(replace(ended, splits=(split,)))
     await until(lambda: read_record(plane.dht.records["task/t-1"].value).splits[0].settled)
     assert later("t-1") == [1, 2]
-
-
-async def test_whoever_has_a_run_is_held_until_its_task_has_ended(manager: TaskManager, plane: Any) -> None:
-    """So that it is missed when it goes, and not before: with a bounded view nobody else would see to that."""
-    subtask = Subtask(id="s1", skill="work")
-    attempt = Attempt(number=1, gateway="gw-3")
-    running = SubtaskRecord(subtask=subtask, state=SubtaskState.RUNNING, gateway="gw-3", attempts=(attempt,))
-    record = replace(plane.accepted(plan=plane.plan_of(subtask)), state=TaskState.RUNNING, subtasks=(running,))
-
-    async def runs(gateway: str, ask: Any) -> RunStatus:
-        del gateway, ask
-        return RunStatus(running=True)
-
-    plane.rpc.on["run_status"] = runs
-    plane.dht.records["task/t-1"] = Record(key="task/t-1", value=encode(record), version={"gw-2": 1})
-    manager._sweep.set()
-    await until(lambda: plane.held == {"task/t-1": frozenset({"gw-3"})})
-    event = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.SUCCEEDED, gateway="gw-3", result={"n": 1})
-    plane.session.put(plane.keys.run("t-1", "s1"), encode(event))
-    await until(lambda: manager.unfinished == 0)
-    assert plane.held == {}
 
 
 async def test_a_cancel_answers_with_the_state_that_came_of_it(manager: TaskManager, plane: Any) -> None:

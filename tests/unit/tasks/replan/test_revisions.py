@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.model import Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord, TaskState, encode
+from appliance.model import Decision, Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord, TaskState, encode
 from appliance.skills.catalogue import Alternative, SkillManifest
 from appliance.tasks import machine, revising
 from appliance.tasks.replan.robots import Rebinding, Robots, another_robot
@@ -258,11 +258,12 @@ def test_nothing_takes_effect_that_was_not_proposed_and_agreed_to() -> None:
     plan = walk.record.plan
     with pytest.raises(StaleTransitionError, match="not proposed"):
         walk.apply(TransitionKind.REPLANNED, subtask="s2", plan=plan)
-    with pytest.raises(StaleTransitionError, match="nothing of task t waits"):
-        walk.apply(TransitionKind.AGREED, subtask="s2")
+    approval = Decision(approved=True, by="ann")
+    with pytest.raises(StaleTransitionError, match="waits for"):
+        walk.apply(TransitionKind.APPROVED, subtask="s2", decision=approval)
     walk.apply(TransitionKind.PROPOSED, subtask="s2", plan=plan, waits=True)
     with pytest.raises(StaleTransitionError, match="second proposal"):
         walk.apply(TransitionKind.PROPOSED, subtask="s2", plan=plan)
-    walk.apply(TransitionKind.AGREED, subtask="s2")
+    walk.apply(TransitionKind.APPROVED, subtask="s2", decision=approval)
     assert walk.record.proposal is not None
     assert not walk.record.proposal.waits

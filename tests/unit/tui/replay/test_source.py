@@ -122,14 +122,14 @@ async def test_screens_are_driven_by_the_log(tmp_path: Path) -> None:
         await until(app, pilot, lambda: len(replay.store.tasks) < len(wanted))
         # So slow that the log's 11 s do not end before the next key is read, however busy the machine is.
         await pilot.press("colon", *"rate 0.25", "enter", "space")
-        await until(app, pilot, lambda: replay.player.at_s(time.monotonic()) > 0.05)
-        assert replay.player.rate == 0.25
+        await until(app, pilot, lambda: replay.head.position_s(time.monotonic()) > 0.05)
+        assert replay.head.rate == 0.25
         await pilot.press("space")
         await pilot.pause()
-        assert not replay.player.playing
-        at_s = replay.player.at_s(time.monotonic())
+        assert replay.head.paused
+        at_s = replay.head.position_s(time.monotonic())
         await pilot.press("left")
-        assert replay.player.at_s(time.monotonic()) <= at_s
+        assert replay.head.position_s(time.monotonic()) <= at_s
         await until(app, pilot, lambda: not replay.problem)
 
 
@@ -139,7 +139,7 @@ async def test_keys_of_the_log_can_be_listened_to() -> None:
     heard: list[str] = []
     closer = replay.tap("swiftbot/*/task/*/record", lambda key, _at, _payload, _deleted: heard.append(key))
     await replay.start()
-    replay.player.seek(replay.player.length_s, time.monotonic())
+    replay.head.seek(replay.about.end_ns, time.monotonic())
     async with asyncio.timeout(30):
         while not heard:
             await asyncio.sleep(0.05)

@@ -1,0 +1,243 @@
+"""Leases between gateways: the shell round `grants`."""
+
+import asyncio
+import hashlib
+import random
+import secrets
+import time
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import ConfigError, ConflictError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane.quorum import grants
+from appliance.plane.quorum.grants import LONGEST_S, Granted, Grantor, LeaseAsk, LeaseEnd, Released, majority
+from appliance.plane.ring import Ring
+from appliance.plane.rpc import Rpc
+from appliance.plane.settings import PlaneConfig
+from appliance.plane.store import Store
+from appliance.plane.versions import check_key
+
+log = structlog.get_logger(__name__)
+
+_FENCE = "lease-fence"
+_LOST = "lease-lost"
+_ASK_S = 1.0
+"""One question to a grantor; all are asked at once, and a majority of answers is enough."""
+_TRY_S = 1.0
+"""How long an acquisition tries again while others' share the grantors with it, or its fence is behind."""
+_BACK_OFF_S = (0.005, 0.05)
+"""Between tries: drawn, so that two do not keep step."""
+_DRIFT = 0.01
+"""The holder's lease ends earlier than its grants by this share: clocks of two machines do not run equally fast."""
+
+Asked = TypeVar("Asked", LeaseAsk, LeaseEnd)
+Answer = TypeVar("Answer", bound=Struct)
+
+
+class Lease(Struct, frozen=True, kw_only=True):
+    """A lease as its holder has it."""
+
+    key: str
+    holder: str
+    fence: int
+    """Higher than that of every lease on the key before: hand it on with what the lease protects."""
+    until: float
+    """On the holder's clock (`CLOCK_BOOTTIME`, seconds), which runs on while the machine is suspended."""
+
+    @property
+    def left_s(self) -> float:
+        """Seconds that are left; 0 when it has ended."""
+        return max(0.0, self.until - _holder_clock())
+
+
+class Leases:
+    """One gateway's part in the leases: as a grantor, and for its own callers. `start` before use."""
+
+    def __init__(self, config: PlaneConfig, *, gateway: str, store: Store, rpc: Rpc) -> None:
+        self._config = config
+        self._gateway = gateway
+        self._store = store
+        self._rpc = rpc
+        self._ring = Ring(config.voters, virtual_nodes=config.virtual_nodes)
+        named = f"{sorted(config.voters)} {config.replicas} {config.virtual_nodes}"
+        self.digest = hashlib.blake2b(named.encode(), digest_size=8).hexdigest()
+        """Of the grantors as they are configured here: all must have the same."""
+        self._grantor: Grantor | None = None
+        self._highest = 0
+        """Highest fence heard of."""
+        rpc.register("lease_grant", LeaseAsk, self.on_grant, exchange=False)
+        rpc.register("lease_release", LeaseEnd, self.on_release, exchange=False)
+
+    async def start(self, *, lost: bool) -> None:
+        """Begin to grant. `lost`: the store's file could not be read, and with it went the highest fence."""
+        if lost:
+            await self._store.put(_LOST, b"1")
+        if await self._store.get(_LOST) is None:
+            fence = int(await self._store.get(_FENCE) or 0)
+            self._grantor = Grantor(fence=fence, now=time.monotonic())
+        elif self._gateway in self._config.voters:
+            log.error(
+                "this gateway grants no leases: its fences were lost with its file",
+                remedy="give it a new id and name that in plane.voters in place of the old one",
+            )
+
+    # --- the door ---------------------------------------------------------------------------------------------
+
+    def grantors(self, key: str) -> tuple[str, ...]:
+        """The gateways that grant a key, there or not; ConfigError when none are configured."""
+        if not self._config.voters:
+            raise ConfigError(
+                "a lease was asked for, and plane.voters names nobody",
+                remedy="name the gateways that grant leases in plane.voters, the same at every gateway",
+            )
+        return self._ring.successors(check_key(key), self._config.replicas)
+
+    async def acquire(self, key: str, *, ttl_s: float) -> Lease:
+        """Lease a key for `ttl_s` seconds (at most 30); while it lasts nobody else has it, on whatever side of a cut.
+
+        Raises:
+            ConfigError: `plane.voters` is empty, or `ttl_s` out of bounds.
+            ConflictError: another has it.
+            UnreachableError: fewer than a majority of the key's grantors answer.
+        """
+        holder = f"{self._gateway}:{secrets.token_hex(8)}"
+        until = time.monotonic() + _TRY_S
+        while True:
+            fence, lease, answers = await self._ask(key, holder, ttl_s)
+            if lease is not None:
+                return lease
+            if any(answer.granted for answer in answers):
+                await self._end(key, holder, fence)  # what a minority has granted must not keep the next one out
+            self._refuse(key, answers)
+            if time.monotonic() > until:
+                raise ConflictError(f"{key} is contended", remedy="try again in a moment")
+            await asyncio.sleep(random.uniform(*_BACK_OFF_S))  # noqa: S311 - spreads load, protects nothing
+
+    async def renew(self, lease: Lease, *, ttl_s: float) -> Lease:
+        """Hold a lease for `ttl_s` seconds from now; when that fails the lease given lasts as long as it did.
+
+        Raises:
+            ConflictError: it has ended: what it protected may be another's.
+            UnreachableError: fewer than a majority of the key's grantors answer, or grant it.
+        """
+        if not lease.left_s:
+            raise ConflictError(f"the lease on {lease.key} has ended", remedy="acquire it anew")
+        until = time.monotonic() + min(_TRY_S, lease.left_s)
+        while True:
+            _, renewed, answers = await self._ask(lease.key, lease.holder, ttl_s)
+            if renewed is not None:
+                return renewed
+            self._refuse(lease.key, answers)
+            if time.monotonic() > until:
+                raise UnreachableError(f"the lease on {lease.key} could not be renewed", remedy="try again")
+            await asyncio.sleep(random.uniform(*_BACK_OFF_S))  # noqa: S311 - spreads load, protects nothing
+
+    async def release(self, lease: Lease) -> None:
+        """Give a lease back; with grantors that do not hear of it it ends by itself."""
+        await self._end(lease.key, lease.holder, lease.fence)
+
+    # --- asking -----------------------------------------------------------------------------------------------
+
+    async def _ask(self, key: str, holder: str, ttl_s: float) -> tuple[int, Lease | None, list[Granted]]:
+        """Ask all grantors once, under a fence above all that were heard of.
+
+        Returns:
+            The fence, the lease if a majority granted it, and the answers.
+        """
+        grantors = self.grantors(key)
+        if not 0 < ttl_s <= LONGEST_S:
+            raise ConfigError(f"a lease of {ttl_s:g} s", remedy=f"more than 0, at most {LONGEST_S:g} s")
+        self._highest += 1
+        ask = LeaseAsk(key=key, holder=holder, fence=self._highest, ttl_s=ttl_s, voters=self.digest)
+        # From before they are asked: each grant ends later than this.
+        until = _holder_clock() + ttl_s * (1 - _DRIFT)
+
+        def enough(answers: list[Granted]) -> bool:
+            return grants.granted(answers, len(grantors)) or grants.holder(answers, len(grantors)) is not None
+
+        answers = await self._poll(grantors, "lease_grant", ask, Granted, self.on_grant, enough)
+        self._highest = grants.highest(self._highest, answers)
+        if not grants.granted(answers, len(grantors)) or until <= _holder_clock():
+            return ask.fence, None, answers
+        return ask.fence, Lease(key=key, holder=holder, fence=ask.fence, until=until), answers
+
+    def _refuse(self, key: str, answers: list[Granted]) -> None:
+        """Raise where asking again at once is of no use."""
+        grantors = self.grantors(key)
+        if (other := grants.holder(answers, len(grantors))) is not None:
+            name, left_s = other
+            raise ConflictError(f"{key} is leased to {name} for {left_s:.1f} s", remedy="try again then")
+        if len(answers) < majority(len(grantors)):
+            raise UnreachableError(
+                f"{len(answers)} of {', '.join(grantors)} answer for {key}, {majority(len(grantors))} are needed",
+                remedy="try again when they are back",
+            )
+
+    async def _end(self, key: str, holder: str, fence: int) -> None:
+        end = LeaseEnd(key=key, holder=holder, fence=fence, voters=self.digest)
+        await self._poll(self.grantors(key), "lease_release", end, Released, self.on_release, lambda _: False)
+
+    async def _poll(
+        self,
+        grantors: tuple[str, ...],
+        verb: str,
+        ask: Asked,
+        kind: type[Answer],
+        here: Callable[[Asked], Awaitable[Answer]],
+        enough: Callable[[list[Answer]], bool],
+    ) -> list[Answer]:
+        """Ask all grantors at once; returns the answers as soon as they are enough, or when no more will come."""
+
+        async def one(grantor: str) -> Answer | None:
+            try:
+                if grantor == self._gateway:
+                    return await here(ask)
+                return await self._rpc.call(grantor, verb, ask, kind, timeout_s=_ASK_S)
+            except SwiftbotError as error:
+                log.debug("a grantor does not answer", grantor=grantor, verb=verb, reason=str(error))
+                return None
+
+        answers: list[Answer] = []
+        waiting = {asyncio.create_task(one(grantor)) for grantor in grantors}
+        try:
+            while waiting and not enough(answers):
+                finished, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+                answers += [answer for task in finished if (answer := task.result()) is not None]
+        finally:
+            for task in waiting:
+                task.cancel()
+        return answers
+
+    # --- granting ---------------------------------------------------------------------------------------------
+
+    async def on_grant(self, asked: LeaseAsk) -> Granted:
+        """Grant, with the fence on the disk before the answer."""
+        grantor = self._granting(asked)
+        answer = grantor.grant(asked, time.monotonic())
+        if answer.granted:
+            await self._store.put(_FENCE, str(grantor.fence).encode())
+        return answer
+
+    async def on_release(self, ended: LeaseEnd) -> Released:
+        """Drop a grant."""
+        self._granting(ended).release(ended)
+        return Released()
+
+    def _granting(self, asked: LeaseAsk | LeaseEnd) -> Grantor:
+        if asked.voters != self.digest:
+            raise RefusedError(
+                f"{self._gateway} is told other voters than whoever asks",
+                remedy="plane.voters, replicas and virtual_nodes must be the same at every gateway",
+            )
+        if self._gateway not in self.grantors(asked.key):
+            raise RefusedError(f"{self._gateway} does not grant {asked.key}")
+        if self._grantor is None:
+            raise RefusedError(f"{self._gateway} has lost its fences and grants nothing", remedy="give it a new id")
+        return self._grantor
+
+
+def _holder_clock() -> float:
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
