@@ -93,11 +93,12 @@ class Healing(Struct, frozen=True, kw_only=True):
     """Who each note is for: whoever gave the order that lost, else any operator."""
 
     async def settle(self, plane: Plane, keeper: Keeper) -> None:
-        """Write it into the record, then end what is doubled and tell people."""
-        keeper.apply(keeper.transition(TransitionKind.HEALED, splits=self.splits, fences=self.fences))
-        await keeper.flush()
+        """Tell people, write it into the record, then end what is doubled.
+
+        Told first: when two gateways settle at once, the mark that it is settled may stand though the write of whoever
+        made it is refused, or its driver is ended meanwhile. Told twice it is the same notice, by its id.
+        """
         task = keeper.record.id
-        await asyncio.gather(*(_end(plane, task, run) for run in self.ends))
         for name, note, to in zip(self.noted, self.notes, self.to, strict=True):
             notice = Notice(
                 id=f"{task}/healed/{name}",
@@ -109,6 +110,9 @@ class Healing(Struct, frozen=True, kw_only=True):
             )
             plane.session.put(plane.keys.notice(to), encode(notice))
             log.warning("a partition has healed", task=task, note=note)
+        keeper.apply(keeper.transition(TransitionKind.HEALED, splits=self.splits, fences=self.fences))
+        await keeper.flush()
+        await asyncio.gather(*(_end(plane, task, run) for run in self.ends))
 
 
 async def _end(plane: Plane, task: str, run: LostRun) -> None:

@@ -26,7 +26,7 @@ from appliance.model import (
 from appliance.plane.dht import Record
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.healing import foreign, heal
-from appliance.tasks.keeper import Keeper
+from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import apply
 from appliance.tasks.resolve import merged, split_of
 from appliance.tasks.surroundings import RunNews, task_key
@@ -232,3 +232,14 @@ def test_fences_survive_the_loss_of_the_version_that_set_them(plane: Any) -> Non
     assert heal(record_of(plane, replace(split(lost(1, "gw-3")), settled=True))) is None, "below its own: fenced off"
     done = replace(record.subtasks[0], state=SubtaskState.SUCCEEDED)
     assert heal(replace(record, subtasks=(done,))) is None, "there will be no next attempt"
+
+
+async def test_people_are_told_though_another_gateway_settles_at_once(plane: Any) -> None:
+    """Whose write stands is not known to whoever is refused, and the mark of either outlives: both tell the same."""
+    record = record_of(plane, split(lost(2, "gw-3")))
+    healing = heal(record)
+    assert healing is not None
+    plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(record), version={"gw-2": 8})
+    with pytest.raises(SupersededError):
+        await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
+    assert [each.id for each in plane.session.sent(plane.keys.notice(), Notice)] == ["t-1/healed/gw-3-9"]
