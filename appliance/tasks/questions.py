@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from msgspec.structs import replace
 
 from appliance.errors import NotFoundError, UnreachableError
-from appliance.model import TaskRecord, Word
+from appliance.model import TaskRecord, TaskState, Word
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.tasks.api import TaskAsk, TaskList, TasksAsk, WhyAsk
@@ -107,9 +107,13 @@ class Questions:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(CANCEL_S):
                         await driver.ending.wait()
-                # One that is not written in time stays noted: the record says that it is not confirmed.
-                return await self.task(TaskAsk(id=ask.id))
-            record = await self.task(TaskAsk(id=ask.id))
+                record = await self.task(TaskAsk(id=ask.id))
+                if not driver.ending.is_set() or record.state.final or record.state is TaskState.CANCELLING:
+                    return record  # what is not written in time stays noted: the record says that it is not confirmed
+                # It has stepped down, since the record changed under it: the next one is told.
+                self._sweep.set()
+            else:
+                record = await self.task(TaskAsk(id=ask.id))
             if record.state.final:
                 return record
             await asyncio.sleep(0.1)

@@ -188,9 +188,10 @@ async def test_a_task_whose_end_could_not_be_written_is_driven_again(manager: Ta
     await until(lambda: manager._drivers["t-1"].record.state is TaskState.RUNNING)
     await asyncio.sleep(0.05)
     plane.dht.break_next = [UnreachableError("no owner")]
-    await manager.cancel(CancelTaskAsk(id="t-1"))
+    answer = await manager.cancel(CancelTaskAsk(id="t-1"))
+    assert answer.state in (TaskState.CANCELLING, TaskState.CANCELLED)
     await until(lambda: manager.unfinished == 0)
-    await until(lambda: manager.unfinished == 1)
+    assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
 
 
 async def test_a_driver_that_breaks_again_and_again_ends_its_task_with_the_reason(
@@ -422,6 +423,19 @@ async def test_a_task_that_goes_on_under_its_coordinator_is_driven_from_there(ma
     await until(lambda: manager._drivers["t-1"].told.coordinator == "gw-1")
     assert manager._drivers["t-1"].told.state is TaskState.RUNNING
     assert plane.dht.records["task/t-1"].version["gw-2"] == 1, "the approval's write is in what was written since"
+
+
+async def test_a_cancel_goes_to_the_driver_that_follows_one_that_steps_down(manager: TaskManager, plane: Any) -> None:
+    """The record changes under a driver that was just told to cancel: the next one is told, and the answer is true."""
+    stored = await waiting(manager, plane)
+    before = manager._drivers["t-1"]
+    cancel = asyncio.create_task(manager.cancel(CancelTaskAsk(id="t-1", by="ann")))
+    other = replace(read_record(stored.value), coordinator="gw-2", sequence=9)
+    plane.dht.change(Record(key=stored.key, value=encode(other), version={**stored.version, "gw-2": 1}))
+    answer = await cancel
+    assert answer.state is TaskState.CANCELLED
+    assert manager._drivers.get("t-1") is not before
+    assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
 
 
 async def test_a_driver_of_a_key_that_is_anothers_answers_for_nobody(manager: TaskManager, plane: Any) -> None:
