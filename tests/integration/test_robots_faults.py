@@ -271,7 +271,9 @@ async def test_a_second_robot_of_a_name_is_refused_and_reported(tmp_path: Path) 
         )  # fmt: skip
         try:
             await it.until(lambda: "another robot calls itself rover_1" in it.robots()["rover_1"].note)
-            assert "a second robot that calls itself rover_1 is refused" in notices.get_nowait().text
+            async with asyncio.timeout(10):
+                while "a second robot that calls itself rover_1 is refused" not in (await notices.get()).text:
+                    pass
             order: dict[str, Any] = {"waypoints": [{"x": 10.0, "y": 4.0}], "speed_mps": 2.0}
             states: list[RobotInfo] = []
             session, keys = it.client.plane.session, it.client.plane.keys
