@@ -4,7 +4,7 @@ from rich.console import RenderableType
 
 from appliance.client import FleetClient
 from appliance.errors import PayloadError
-from appliance.model import TaskRecord
+from appliance.model import TaskRecord, TaskState
 from appliance.reasons import why_text
 from appliance.steering import cancel_outcome
 from appliance.tasks.migration.api import MigrateAsk
@@ -23,10 +23,11 @@ def split_subtask(text: str) -> tuple[str, str]:
     return task, subtask
 
 
-async def cancel(fleet: FleetClient, given: Given, _by: str) -> str:
+async def cancel(fleet: FleetClient, given: Given, _by: str) -> TaskRecord | str:
     """Stop a task."""
     record = await fleet.cancel(given["task"], why=given.get("why", ""))
-    return cancel_outcome(record)
+    # The record is shown in its row at once; what is none of its own doing is said in words.
+    return record if record.state in (TaskState.CANCELLING, TaskState.CANCELLED) else cancel_outcome(record)
 
 
 async def why(fleet: FleetClient, given: Given, _by: str) -> RenderableType:

@@ -165,7 +165,7 @@ async def test_task_from_instruction_to_end(gateway: Gateway, app: SwiftbotApp) 
         gateway.session.put(gateway.keys.task(request.id), encode(running))
         await _see(app, pilot, "● s1 goto r1", "25%")
         await pilot.press("c", "y")
-        await _see(app, pilot, "is being cancelled")
+        await _see(app, pilot, "cancelling")
         assert gateway.cancelled == [request.id]
 
 
