@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import Reading, normalise, read
 from appliance.llm.settings import PlanContext
-from appliance.model import Plan, RobotInfo
+from appliance.model import Plan, RobotInfo, Site
 
 _NUMBER = r"[-−]?\d{1,4}(?:\.\d+)?"
 _POINT = re.compile(
@@ -76,7 +76,7 @@ def told(context: PlanContext) -> Told:
     robots = _meant(found, context.robots)
     if normalise(context.instruction)[0] != context.instruction:
         return Told(instruction=context.instruction, robots=robots)
-    text, points = _with_points(_with_names(context.instruction, found, context.robots))
+    text, points = _with_points(_with_names(context.instruction, found, context.robots), context.site)
     return Told(instruction=text, robots=robots, points=points)
 
 
@@ -93,8 +93,8 @@ def _with_names(text: str, found: Reading, robots: Sequence[RobotInfo] | None) -
     return text
 
 
-def _with_points(text: str) -> tuple[str, dict[str, str]]:
-    """Return an instruction with words for its points, and what each stands for."""
+def _with_points(text: str, site: Site | None) -> tuple[str, dict[str, str]]:
+    """Return an instruction with words for its points, and what each stands for: words that name nothing else."""
     points: dict[str, str] = {}
 
     def word(match: re.Match[str]) -> str:
@@ -104,7 +104,8 @@ def _with_points(text: str) -> tuple[str, dict[str, str]]:
         name = next((known for known, point in points.items() if point == figures), "")
         number = len(points) + 7
         while not name:
-            name = "" if re.search(rf"waypoint {number}\b", text, re.IGNORECASE) else f"waypoint {number}"
+            known = site is not None and site.find(f"waypoint {number}") is not None
+            name = "" if known or re.search(rf"waypoint {number}\b", text, re.IGNORECASE) else f"waypoint {number}"
             number += 1
         points[name] = figures
         return name

@@ -1,11 +1,12 @@
 """What planners are told: names, points and the robots that the words can mean; the review goes by what was typed."""
 
 import pytest
+from msgspec.structs import replace
 
 from appliance.bench.intent.cases import roster
 from appliance.llm.rewriting import told
 from appliance.llm.settings import PlanContext
-from appliance.model import Plan, Subtask
+from appliance.model import Place, Plan, Subtask
 from appliance.skills.sites import load_site
 
 
@@ -74,3 +75,13 @@ def test_only_robots_that_the_words_can_mean_are_told(text: str, robots: set[str
 def test_numbers_behind_a_kind_are_told_as_names() -> None:
     """Of "Drones 1, 2 and 3" a planner is told the three names."""
     assert told(context("Drones 1, 2 and 3 take off")).instruction == "drone_1, drone_2 and drone_3 take off"
+
+
+def test_a_word_for_a_point_names_no_place_of_the_site() -> None:
+    """A planner may send a robot to a place of that name: it must not become the point."""
+    asked = context("Fly drone_1 to (26, 6)")
+    assert asked.site is not None
+    (usual,) = told(asked).points
+    site = replace(asked.site, places={**asked.site.places, usual: Place(x=1.0, y=2.0)})
+    (name,) = told(replace(asked, site=site)).points
+    assert site.find(name) is None
