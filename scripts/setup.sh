@@ -337,16 +337,18 @@ make_apart() {
   say "$name: done"
 }
 
-# The package itself, as a pointer to the tree ("editable"), built without network.
+# Product and workshop, each as a pointer to the tree ("editable"), built without network.
 install_package() {
-  local want wheels
-  want="$TREE $(digest "$PROJECT/pyproject.toml" "$PROJECT/README.md")"
+  local want wheels part
+  want="$TREE $(digest "$PROJECT/pyproject.toml" "$PROJECT/workshop/pyproject.toml" "$PROJECT/README.md")"
   if [ -x "$VENV/bin/swiftbot" ] && [ "$(cat "$STATE/package" 2>/dev/null)" = "$want" ]; then return; fi
   make_tools
   say "package: swiftbot command"
   wheels=$(cd / && as_user mktemp -d /tmp/swiftbot-wheel.XXXXXX)
-  (cd "$TREE" && quiet "package: build" "see the lines above" as_user "$TOOLS/bin/python" -c \
-    'import sys; from hatchling.build import build_editable; build_editable(sys.argv[1])' "$wheels") || exit 1
+  for part in . workshop; do
+    (cd "$TREE/$part" && quiet "package: build $part" "see the lines above" as_user "$TOOLS/bin/python" -c \
+      'import sys; from hatchling.build import build_editable; build_editable(sys.argv[1])' "$wheels") || exit 1
+  done
   quiet "package: install" "see the lines above" "$TOOLS/bin/uv" pip install --quiet --no-deps --no-index --reinstall \
     --python "$VENV/bin/python" "$wheels"/*.whl
   rm -rf "$wheels"

@@ -14,9 +14,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from appliance import local_fleet  # noqa: E402 - a script finds the project beside itself
 from appliance.client import FleetClient  # noqa: E402
-from appliance.local_fleet import FleetState, Order  # noqa: E402
+from appliance.fleet_state import FleetState  # noqa: E402
 from appliance.model import Approval, TaskRequest  # noqa: E402
 from appliance.plane.settings import PlaneConfig  # noqa: E402
 from appliance.pool.settings import PoolConfig  # noqa: E402
@@ -24,6 +23,8 @@ from appliance.tui.app import SwiftbotApp  # noqa: E402
 from appliance.tui.data import FleetView  # noqa: E402
 from appliance.tui.replay.source import ReplayView  # noqa: E402
 from appliance.tui.settings import TuiConfig  # noqa: E402
+from workshop import local_fleet  # noqa: E402 - a script finds the project beside itself
+from workshop.local_fleet import Order  # noqa: E402
 
 FOLDER = ROOT / "docs" / "pictures"
 SIZE = (110, 32)

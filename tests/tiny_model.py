@@ -13,9 +13,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers
 
-from appliance.llm.train.card import card_of, write_card
-from appliance.llm.train.tokens import BEGIN, END, Tokens
 from appliance.skills.catalogue import Catalogue
+from workshop.train.card import card_of, write_card
+from workshop.train.tokens import BEGIN, END, Tokens
 
 HIDDEN = 32
 HEADS = 2

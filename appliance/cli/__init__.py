@@ -10,20 +10,18 @@ from rich.markup import escape
 
 from appliance import console, logs
 from appliance.cli import (
-    bench,
     conformance,
     daemons,
-    fleet,
     hands,
     moves,
     plane,
     planning,
+    plugins,
     pool,
     recordings,
     robots,
     steer,
     tools,
-    train,
     work,
 )
 from appliance.errors import Exit, SwiftbotError
@@ -32,7 +30,6 @@ app = App(
     name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
 )
 for part in (
-    fleet,
     work,
     planning,
     moves,
@@ -45,8 +42,7 @@ for part in (
     recordings,
     plane,
     tools,
-    train,
-    bench,
+    plugins,
 ):
     part.add_to(app)
 

@@ -1,4 +1,4 @@
-"""What runs until it is told to stop: `swiftbot gateway`, `record`, `sim …`."""
+"""What runs until it is told to stop: `swiftbot gateway`, `router`, `record`, `foxglove`."""
 
 import asyncio
 import os
@@ -13,14 +13,11 @@ from cyclopts import App, Parameter
 from appliance import logs, service
 from appliance.cli.common import DAEMONS, HERE, Where
 
-sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
-
 
 def add_to(app: App) -> None:
     """Add these commands."""
     for command in (gateway, router, record, foxglove):
         app.command(command, group=DAEMONS)
-    app.command(sim_app)
 
 
 def gateway(*, config: Path) -> int:
@@ -67,7 +64,7 @@ def router(
 
     async def go() -> None:
         plane = PlaneConfig(mode="router", listen=listen, connect=connect, lease_ms=lease_ms)
-        await run_router(plane, stop=_until_signalled(), ready=lambda _: service.ready(), alive=service.alive)
+        await run_router(plane, stop=until_signalled(), ready=lambda _: service.ready(), alive=service.alive)
 
     uvloop.run(go())
     return 0
@@ -105,7 +102,7 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
     async def go() -> None:
         # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
         plane = PlaneConfig(mode="peer", connect=connect)
-        await run_recorder(settings, plane, fleet, _until_signalled(), alive=_tell_systemd, about=told)
+        await run_recorder(settings, plane, fleet, until_signalled(), alive=_tell_systemd, about=told)
 
     uvloop.run(go())
     return 0
@@ -149,7 +146,7 @@ def foxglove(
     async def go() -> None:
         options = LiveOptions(host=host, port=port, keys=keys)
         plane = PlaneConfig(mode="peer", connect=connect)
-        await serve(options, plane, fleet, _until_signalled(), about=told, told=_tell_systemd)
+        await serve(options, plane, fleet, until_signalled(), about=told, told=_tell_systemd)
 
     uvloop.run(go())
     return 0
@@ -160,96 +157,9 @@ def _tell_systemd(_: object) -> None:
     service.alive()
 
 
-def _until_signalled() -> asyncio.Event:
+def until_signalled() -> asyncio.Event:
+    """Return an event that SIGINT and SIGTERM set."""
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     return stop
-
-
-@sim_app.command
-def mavlink(
-    *,
-    to: str,
-    listen: Annotated[bool, Parameter(negative="")] = False,
-    system: int = 1,
-    site: str = "warehouse",
-    rate: float = 1.0,
-    start: str = "home",
-    kind: Literal["copter", "rover"] = "copter",
-    parameter: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    drop: float = 0.0,
-    double: float = 0.0,
-    mix: float = 0.0,
-    delay_s: float = 0.0,
-    seed: int = 1,
-) -> int:
-    """Simulate a MAVLink vehicle that sends to a gateway, or waits for one.
-
-    Args:
-        to: Where the gateway listens, udp://host:port or tcp://host:port.
-        listen: Listen there (tcp), as SITL does, and let the gateway connect.
-        system: MAVLink system id, 1 to 255.
-        site: Built-in site or site file.
-        rate: How many times faster than real it moves.
-        start: Place it starts at.
-        kind: A multirotor or a rover.
-        parameter: NAME=VALUE of its autopilot that differ from the usual, such as SIM_WIND_SPD=6 or FENCE_ENABLE=1.
-        drop: Share of frames that its link loses, each way.
-        double: Share of frames that arrive twice.
-        mix: Share of frames that arrive after later ones.
-        delay_s: Time that frames are on their way.
-        seed: Of the link's chances: the same one loses the same frames.
-    """
-    from appliance.robots.sim.mavlink import VehicleSettings, read_parameters, run_vehicle
-    from appliance.skills.sites import load_site
-
-    logs.configure(style="text")
-    settings = VehicleSettings(
-        to=to,
-        listen=listen,
-        system=system,
-        site=load_site(site),
-        rate=rate,
-        start=start,
-        kind=kind,
-        parameters=read_parameters(parameter),
-        drop=drop,
-        double=double,
-        mix=mix,
-        delay_s=delay_s,
-        seed=seed,
-    )
-
-    async def go() -> None:
-        await run_vehicle(settings, stop=_until_signalled())
-
-    asyncio.run(go())
-    return 0
-
-
-@sim_app.command
-def zenoh(*, name: str, site: str = "warehouse", rate: float = 1.0, start: str = "charger", where: Where = HERE) -> int:
-    """Simulate a mobile robot with arm and camera that speaks Zenoh.
-
-    Args:
-        name: Its name in the roster.
-        site: Built-in site or site file.
-        rate: How many times faster than real it moves.
-        start: Place it starts at.
-        where: The fleet.
-    """
-    from appliance.robots.sim.zenoh_robot import RobotSettings, run_robot
-    from appliance.skills.sites import load_site
-
-    logs.configure(style="text")
-    endpoint = where.endpoint()
-    settings = RobotSettings(
-        name=name, fleet=endpoint.fleet, connect=endpoint.connect, site=load_site(site), rate=rate, start=start
-    )
-
-    async def go() -> None:
-        await run_robot(settings, stop=_until_signalled())
-
-    asyncio.run(go())
-    return 0

@@ -16,12 +16,35 @@ from msgspec.structs import replace
 from appliance import console
 from appliance.cli.common import Where
 from appliance.client import FleetClient
-from appliance.demo import follow
 from appliance.errors import NotFoundError, SwiftbotError, UnreachableError
 from appliance.llm.stop_words import mentions_stop, stop_request
-from appliance.model import Approval, Plan, TaskRecord, TaskRequest, TaskState
+from appliance.model import Approval, Plan, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.steering import read_plan_file
 from appliance.stopping import Stopped, roster_of
+
+
+async def follow(client: FleetClient, task: str, *, plan_shown: bool = False) -> TaskRecord:
+    """Show a task's plan, each change of a subtask, and the results at its end; returns its last record.
+
+    A plan that waits for approval is shown at once, with why it waits and how to approve it.
+    """
+    shown_plan, held = plan_shown, ""
+    told: dict[str, tuple[SubtaskState, str, int]] = {}
+    record: TaskRecord | None = None
+    async for record in client.watch(task):
+        held = console.tell_held(record, held)
+        if record.plan is not None and record.subtasks and not shown_plan:
+            shown_plan = True
+            console.out.print(console.plan_graph(record.plan))
+        for each in record.subtasks:
+            # Whole tenths of progress: a line a step, not one a message.
+            news = (each.state, each.note if not each.progress else "", int(each.progress * 10) // 3)
+            if told.get(each.subtask.id, (SubtaskState.WAITING, "", 0)) != news:
+                told[each.subtask.id] = news
+                console.out.print(console.progress_line(each), style="dim")
+    assert record is not None  # noqa: S101 - watch yields at least the final record
+    console.out.print(console.task_table(record))
+    return record
 
 
 class Submitting:

@@ -209,7 +209,7 @@ def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
     if config.mode == "client":
         return UnreachableError(
             f"nothing answers at {', '.join(config.connect)}",
-            remedy="is the fleet up? try `swiftbot up` or `--connect`",
+            remedy="start a gateway (`swiftbot gateway`), or name the endpoint of one with --connect",
         )
     return ConfigError(
         f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect, plane.peers"

@@ -109,7 +109,7 @@ class Ring:
     def holders(self, place: int, n: int) -> tuple[str, ...]:
         """The same for a position."""
         if not self.points:
-            raise UnreachableError("the ring has no gateway", remedy="start one: `swiftbot up` or `swiftbot gateway`")
+            raise UnreachableError("the ring has no gateway", remedy="start one with `swiftbot gateway`")
         # A point equal to the position owns it.
         start = bisect_left(self.points, place)
         wanted = min(n, len(self.members))

@@ -276,7 +276,7 @@ def check(paths: Sequence[Path], *, progress: Callable[[int], None] = lambda _: 
         problems += [f"{path.name}: {each}" for each in found]
     if not checker.checked and not checker.unchecked:
         raise RecordError(
-            f"there is no decision in {_names(paths)}", remedy="record while tasks run: `swiftbot up` starts a recorder"
+            f"there is no decision in {_names(paths)}", remedy="record while tasks run, with `swiftbot record`"
         )
     return CheckReport(
         logs=tuple(str(path) for path in paths),

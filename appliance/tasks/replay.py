@@ -104,7 +104,7 @@ def replay(path: Path) -> ReplayReport:
         except msgspec.DecodeError:
             counts["unreadable"] += 1
     if not tasks:
-        raise RecordError(f"{path} holds no task", remedy="record while tasks run: `swiftbot up` starts a recorder")
+        raise RecordError(f"{path} holds no task", remedy="record while tasks run, with `swiftbot record`")
     outcomes = tuple(_outcome(task, folding) for task, folding in sorted(tasks.items()))
     return ReplayReport(
         path=str(path),

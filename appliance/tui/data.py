@@ -225,7 +225,7 @@ class FleetView:
         self.store.take_task(record)
 
     def _remedy(self) -> str:
-        return "start one with `swiftbot up` or name its endpoint with --connect; trying again by itself"
+        return "start one with `swiftbot gateway`, or name its endpoint with --connect; trying again by itself"
 
     # --- what is measured from here ------------------------------------------------------------------------
 

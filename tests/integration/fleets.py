@@ -7,11 +7,12 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from appliance import local_fleet
 from appliance.config import GatewayConfig
+from appliance.fleet_state import FleetState
 from appliance.llm.settings import LlmConfig
-from appliance.local_fleet import FleetState, Order
 from appliance.pool.settings import PoolConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 RULES = LlmConfig(tiers=("rules",))
 """Where plans are not what a test is about: the same words always give the same plan, and no gateway loads a model."""

@@ -14,15 +14,16 @@ import msgspec
 from fleets import RULES
 
 from appliance import config as configuration
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.settings import TasksConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 COUNTER = """
 import time

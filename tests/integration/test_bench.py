@@ -12,8 +12,8 @@ import psutil
 import pytest
 from fleets import INTERRUPTIBLE
 
-from appliance.bench import actors, federated, migrate, overload, pooled, rate, refill, soak, startup, transfer, zygote
 from appliance.pool.engine import PodmanEngine
+from workshop.bench import actors, federated, migrate, overload, pooled, rate, refill, soak, startup, transfer, zygote
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
 

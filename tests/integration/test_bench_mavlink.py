@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.bench.mavlink import others, tlog
-from appliance.bench.mavlink.run import Options, run
 from appliance.errors import ConfigError, PrerequisiteError
+from workshop.bench.mavlink import others, tlog
+from workshop.bench.mavlink.run import Options, run
 
 pytestmark = pytest.mark.anyio
 

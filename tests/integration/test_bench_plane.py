@@ -9,9 +9,9 @@ import psutil
 import pytest
 from fleets import INTERRUPTIBLE
 
-from appliance.bench import idle
-from appliance.bench.failover import restart, takeover
-from appliance.bench.members import run as members
+from workshop.bench import idle
+from workshop.bench.failover import restart, takeover
+from workshop.bench.members import run as members
 
 pytestmark = [pytest.mark.anyio, pytest.mark.fleet, pytest.mark.timeout(400)]
 

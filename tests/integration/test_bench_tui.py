@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.bench.tui.run import run
+from workshop.bench.tui.run import run
 
 pytestmark = pytest.mark.anyio
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.bench.chaos.run import Options, run
+from workshop.bench.chaos.run import Options, run
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(600)]
 

@@ -18,11 +18,10 @@ from fleets import PLAIN, RULES
 from pymavlink import mavutil
 
 from appliance import config as configuration
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, NotFoundError
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import ContainerState, Phase, RobotCommand, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
@@ -31,6 +30,8 @@ from appliance.robots.mavlink.requests import task_number
 from appliance.robots.settings import RobotsConfig, Template
 from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskRejected
 from appliance.tasks.replay import replay
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

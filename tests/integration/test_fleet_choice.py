@@ -16,10 +16,9 @@ import pytest
 from fleets import RULES
 from msgspec.structs import replace
 
-from appliance import local_fleet
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import (
     ContainerState,
     Need,
@@ -41,6 +40,8 @@ from appliance.plane.messages import Found, KeyAsk
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.checkpoints import checkpoint_key
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
 

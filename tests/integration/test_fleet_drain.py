@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 from fleets import INTERRUPTIBLE, PLAIN
 
-from appliance import local_fleet
 from appliance.client import FleetClient
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

@@ -15,10 +15,9 @@ from typing import Any
 import pytest
 from fleets import RULES
 
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import (
     Need,
     Plan,
@@ -33,6 +32,8 @@ from appliance.model import (
     TaskState,
 )
 from appliance.pool.settings import PoolConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(400)]
 

@@ -11,10 +11,10 @@ import msgspec
 import pytest
 from fleets import fleet_in
 
-from appliance import local_fleet
 from appliance.client import FleetClient
-from appliance.local_fleet import FleetState, Process
+from appliance.fleet_state import FleetState, Process
 from appliance.model import GatewayStatus
+from workshop import local_fleet
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

@@ -18,16 +18,17 @@ import pytest
 from fleets import INTERRUPTIBLE
 from msgspec.structs import replace
 
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.fleet_state import FleetState
 from appliance.llm.settings import LlmConfig
-from appliance.local_fleet import FleetState, Order
 from appliance.model import Plan, RevisionKind, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.replan.settings import ReplanConfig
 from appliance.tasks.replay import replay
 from appliance.tasks.settings import TasksConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
 

@@ -18,10 +18,10 @@ from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.slot import Slot
 from appliance.llm.speaking import Card, Question, read_card
-from appliance.llm.train.card import write_card
-from appliance.llm.train.tokens import Tokens
 from appliance.llm.voices import ROOM, TooLongError, Voice, Voices
 from appliance.skills.catalogue import load_catalogue
+from workshop.train.card import write_card
+from workshop.train.tokens import Tokens
 
 CATALOGUE = load_catalogue()
 WORDS = ("rex", "fetches", "the", "drill", "from", "bay", "2", "rex")

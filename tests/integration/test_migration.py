@@ -12,20 +12,21 @@ import msgspec
 import pytest
 from moving_bench import counting, ended, fleet_of, further_gateway, pretty, until_running
 
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, RefusedError
+from appliance.fleet_state import FleetState
 from appliance.model import Plan, RobotCommand, Subtask, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig, PressureConfig
 from appliance.record.reader import read
 from appliance.tasks.migration.api import MigrateAsk, MigrationRequest
 from appliance.tasks.migration.settings import MigrationConfig
 from appliance.tasks.replay import replay
+from workshop import local_fleet
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 
 
-async def swiftbot(state: local_fleet.FleetState, *arguments: str) -> tuple[int, str, str]:
+async def swiftbot(state: FleetState, *arguments: str) -> tuple[int, str, str]:
     """Run a command of the command line; its exit code and what it said."""
     command = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "appliance.cli", *arguments, "--fleet", state.fleet, "--dir", state.directory,

@@ -11,7 +11,7 @@ from moving_bench import ended, fleet_of, pretty, until_running
 
 from appliance.client import FleetClient
 from appliance.errors import RefusedError
-from appliance.local_fleet import FleetState
+from appliance.fleet_state import FleetState
 from appliance.model import Plan, RobotCommand, Subtask, SubtaskRecord, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from appliance.bench.net import space
+from workshop.bench.net import space
 
 pytestmark = [pytest.mark.anyio, pytest.mark.fleet, pytest.mark.timeout(420)]
 

@@ -11,9 +11,9 @@ import pytest
 from pymavlink import mavutil
 from robots_process import Process, gateway_process
 
-from appliance import local_fleet
 from appliance.record.reader import info, read
 from appliance.robots.mavlink.dialect import Codec, Frame, frame_length
+from workshop import local_fleet
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

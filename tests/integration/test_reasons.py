@@ -17,12 +17,13 @@ from fleets import PLAIN
 from msgspec.structs import replace
 from test_pool_socket import Service
 
-from appliance import local_fleet
 from appliance.client import FleetClient
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.replan.settings import ReplanConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
 

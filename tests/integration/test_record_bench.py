@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.bench.recording.run import LAST_S, kill, run
+from workshop.bench.recording.run import LAST_S, kill, run
 
 STARVED_S = 2.0
 """How long a machine that does many other things may keep the recorder from its turn; the benchmark allows none."""

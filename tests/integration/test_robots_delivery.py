@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from appliance.bench.mavlink.delivery import answers, ask_all
-from appliance.bench.mavlink.relay import BadLink, Badness
 from appliance.errors import NotFoundError, RefusedError
 from appliance.model import RobotInfo, RobotLimits, Site, TaskRecord, TaskRequest
 from appliance.plane.session import Session
@@ -19,6 +17,8 @@ from appliance.robots.client import AsyncZenohTaskClient
 from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.robots.settings import MavlinkLink, RobotsConfig
+from workshop.bench.mavlink.delivery import answers, ask_all
+from workshop.bench.mavlink.relay import BadLink, Badness
 
 pytestmark = pytest.mark.anyio
 

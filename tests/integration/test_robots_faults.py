@@ -15,13 +15,13 @@ import pytest
 from robots_process import BEAT, STATION, beats, gateway_process, open_zenoh, read_frames, swiftbot
 
 from appliance.errors import ConflictError, Exit, RefusedError
-from appliance.local_fleet import FleetState
+from appliance.fleet_state import FleetState
 from appliance.model import Notice, Pose, RobotCommand, RobotInfo, RobotReply, encode
 from appliance.robots.mavlink.dialect import Codec, frame_length, make
 from appliance.robots.settings import RobotsConfig, Template
-from appliance.robots.sim.zenoh_robot import RobotSettings, Rover, run_robot
 from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskRejected
 from appliance.skills.sites import load_site
+from workshop.robots.zenoh_robot import RobotSettings, Rover, run_robot
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 FOREIGN = bytes.fromhex("fd06000000050161ea0001020304fdff2ab4")

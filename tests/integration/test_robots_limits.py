@@ -13,15 +13,16 @@ import pytest
 import zenoh
 from fleets import RULES
 
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import RefusedError
+from appliance.fleet_state import FleetState
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
-from appliance.local_fleet import FleetState, Order
 from appliance.model import RobotCommand, RobotReply, TaskRequest, TaskState, encode
 from appliance.pool.settings import PoolConfig
 from appliance.robots.zenoh_client import ZenohTaskClient
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

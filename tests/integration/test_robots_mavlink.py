@@ -21,14 +21,14 @@ from appliance.robots.hub import RobotHub
 from appliance.robots.mavlink.dialect import Codec, make
 from appliance.robots.sending import send_command
 from appliance.robots.settings import MavlinkLink, RobotsConfig
-from appliance.robots.sim.mavlink import VehicleSettings
+from workshop.robots.mavlink import VehicleSettings
 
 pytestmark = pytest.mark.anyio
 
 SITE = Site(places={"home": Place(x=4.0, y=4.0)}, altitude_limit_m=30.0, speed_limit_mps=6.0)
 _PROCESS = """
 import asyncio, sys, msgspec
-from appliance.robots.sim.mavlink import VehicleSettings, run_vehicle
+from workshop.robots.mavlink import VehicleSettings, run_vehicle
 asyncio.run(run_vehicle(msgspec.json.decode(sys.argv[1], type=VehicleSettings)))
 """
 

@@ -35,7 +35,7 @@ from appliance.plane.settings import PlaneConfig
 from appliance.robots import patience
 from appliance.robots.intake import TaskIntake
 from appliance.robots.sending import send_command
-from appliance.robots.sim.zenoh_robot import RobotSettings
+from workshop.robots.zenoh_robot import RobotSettings
 
 pytestmark = pytest.mark.anyio
 
@@ -46,7 +46,7 @@ SITE = Site(
 )
 _PROCESS = """
 import asyncio, sys, msgspec
-from appliance.robots.sim.zenoh_robot import RobotSettings, run_robot
+from workshop.robots.zenoh_robot import RobotSettings, run_robot
 asyncio.run(run_robot(msgspec.json.decode(sys.argv[1], type=RobotSettings)))
 """
 

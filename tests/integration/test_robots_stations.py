@@ -23,7 +23,6 @@ from mavsdk_grpc.mavlink_direct import MavlinkMessage
 from mavsdk_grpc.mission_raw import MissionItem
 from pymavlink import mavutil
 
-from appliance.bench.mavlink import others
 from appliance.errors import PrerequisiteError
 from appliance.model import (
     Place,
@@ -46,14 +45,15 @@ from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.robots.mavlink.requests import task_number
 from appliance.robots.settings import MavlinkLink, RobotsConfig, Template
-from appliance.robots.sim.mavlink import VehicleSettings
+from workshop.bench.mavlink import others
+from workshop.robots.mavlink import VehicleSettings
 
 pytestmark = pytest.mark.anyio
 
 SITE = Site(places={"home": Place(x=4.0, y=4.0)}, altitude_limit_m=30.0, speed_limit_mps=6.0)
 _VEHICLE = """
 import asyncio, sys, msgspec
-from appliance.robots.sim.mavlink import VehicleSettings, run_vehicle
+from workshop.robots.mavlink import VehicleSettings, run_vehicle
 asyncio.run(run_vehicle(msgspec.json.decode(sys.argv[1], type=VehicleSettings)))
 """
 Ports = Callable[..., list[int]]

@@ -11,11 +11,12 @@ import pytest
 from fleets import PLAIN
 from pymavlink import mavutil
 
-from appliance import local_fleet
 from appliance.client import FleetClient
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import RobotInfo, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 LOITER, GUIDED = 5, 4

@@ -18,7 +18,7 @@ from appliance.plane.store import Store
 from appliance.robots.hub import RobotHub
 from appliance.robots.sending import hold_robot, send_command
 from appliance.robots.settings import MavlinkLink, RobotsConfig
-from appliance.robots.sim.mavlink import VehicleSettings
+from workshop.robots.mavlink import VehicleSettings
 
 pytestmark = pytest.mark.anyio
 
@@ -30,7 +30,7 @@ SITE = Site(
 )
 _VEHICLE = """
 import asyncio, sys, msgspec
-from appliance.robots.sim.mavlink import VehicleSettings, run_vehicle
+from workshop.robots.mavlink import VehicleSettings, run_vehicle
 asyncio.run(run_vehicle(msgspec.json.decode(sys.argv[1], type=VehicleSettings)))
 """
 

@@ -13,16 +13,17 @@ import pytest
 from fleets import RULES
 from moving_bench import ended, pretty
 
-from appliance import local_fleet
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.local_fleet import FleetState, Order
+from appliance.fleet_state import FleetState
 from appliance.model import Notice, Plan, RobotCommand, Subtask, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
 from appliance.tasks.detection import DetectionConfig
 from appliance.tasks.replay import replay
 from appliance.tasks.settings import TasksConfig
+from workshop import local_fleet
+from workshop.local_fleet import Order
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
 

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from appliance.client import FleetClient
 from appliance.errors import ConflictError, PayloadError, PlanError, RefusedError, SwiftbotError
-from appliance.local_fleet import FleetState
+from appliance.fleet_state import FleetState
 from appliance.model import (
     Act,
     Approval,

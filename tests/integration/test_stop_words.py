@@ -14,7 +14,7 @@ from fleets import fleet_in
 
 from appliance.client import FleetClient
 from appliance.errors import Exit, RefusedError
-from appliance.local_fleet import FleetState
+from appliance.fleet_state import FleetState
 from appliance.model import TaskRecord, TaskRequest, TaskState
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]

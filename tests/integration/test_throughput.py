@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.bench.throughput.run import Options, run
+from workshop.bench.throughput.run import Options, run
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(300)]
 

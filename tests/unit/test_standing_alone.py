@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from appliance.bench.plan import default_cases
+from workshop.bench.plan import default_cases
 
 BESIDE = re.compile(rb"[.]{2}/shared|SWIFTBOT_[S]HARED|reference data not [f]ound")
 """What named a folder of data beside the project. In brackets, so that it does not find itself."""
@@ -30,7 +30,7 @@ def test_no_file_names_a_folder_beside_the_project(project_root: Path) -> None:
 def test_the_development_cases_are_in_the_package(project_root: Path) -> None:
     """The default of `swiftbot bench plan`, with its scorer: an installed package has them too."""
     cases = default_cases()
-    assert cases.is_relative_to(project_root / "appliance")
+    assert cases.is_relative_to(project_root / "workshop")
     assert cases.is_file()
     assert cases.with_name("score.py").is_file()
 

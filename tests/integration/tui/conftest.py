@@ -15,8 +15,8 @@ from moving_bench import write_skills
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.fleet_state import FleetState
 from appliance.llm.settings import LlmConfig
-from appliance.local_fleet import FleetState
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue

@@ -15,7 +15,7 @@ from fleets import INTERRUPTIBLE, fleet_in
 from PIL import Image
 
 from appliance.client import FleetClient
-from appliance.local_fleet import FleetState
+from appliance.fleet_state import FleetState
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

@@ -213,16 +213,16 @@ async def test_states_of_a_newer_version_are_shown(gateway: Gateway, app: Swiftb
 async def test_lost_gateway_comes_back(app: SwiftbotApp, free_port: int) -> None:
     """Without a gateway the banner names cause and remedy; when one comes, and after it was lost, all is live."""
     async with app.run_test(size=(100, 24)) as pilot:
-        await _see(app, pilot, "✘", "swiftbot up")
+        await _see(app, pilot, "✘", "swiftbot gateway")
         await pilot.press("s", *"walk", "enter")
         await _see(app, pilot, "not connected")
         await pilot.press("escape")
         first = await _gateway(free_port)
-        await _see(app, pilot, "gw-a", lambda text: "swiftbot up" not in text)
+        await _see(app, pilot, "gw-a", lambda text: "swiftbot gateway" not in text)
         await first.close()
-        await _see(app, pilot, "✘", "swiftbot up")
+        await _see(app, pilot, "✘", "swiftbot gateway")
         second = await _gateway(free_port)
-        await _see(app, pilot, "gw-a", lambda text: "swiftbot up" not in text)
+        await _see(app, pilot, "gw-a", lambda text: "swiftbot gateway" not in text)
         await second.close()
 
 
@@ -238,7 +238,7 @@ async def test_the_gateway_it_hangs_on_dies(free_ports: Callable[..., list[int]]
         async with app.run_test(size=(80, 24)) as pilot:
             await _see(app, pilot, "gw-a", "gw-b", "2 gw")
             await one.close()
-            await _see(app, pilot, "gw-b", "1 gw", lambda text: "swiftbot up" not in text)
+            await _see(app, pilot, "gw-b", "1 gw", lambda text: "swiftbot gateway" not in text)
             await pilot.press("s", *"walk", "enter")
             await _see(app, pilot, "Enter runs this plan")
             await pilot.press("enter")

@@ -112,7 +112,7 @@ async def test_what_cannot_be_done_is_said_before_anything_is_written(tmp_path: 
 
 async def test_the_scorer_takes_the_output(tmp_path: Path, catalogue: Catalogue) -> None:
     """Predictions of the rules for a part of the development set are scored without complaint."""
-    from appliance.bench.plan.quality import _scorer, default_cases  # noqa: PLC0415 - the scorer is loaded as the benchmark does
+    from workshop.bench.plan.quality import _scorer, default_cases  # noqa: PLC0415 - the scorer is loaded as the benchmark does
 
     lines = default_cases().read_text().splitlines()[:20]
     cases, out = written(tmp_path / "cases.jsonl", *lines), tmp_path / "out.jsonl"

@@ -3,11 +3,11 @@
 import pytest
 from msgspec.structs import replace
 
-from appliance.bench.intent.cases import roster
 from appliance.llm.rewriting import told
 from appliance.llm.settings import PlanContext
 from appliance.model import Place, Plan, Subtask
 from appliance.skills.sites import load_site
+from workshop.bench.intent.cases import roster
 
 
 def context(text: str, fleet: str = "six") -> PlanContext:

@@ -9,7 +9,7 @@ from appliance.robots.mavlink.craft import Craft
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import RobotsConfig
-from appliance.robots.sim.copter import SimCopter
+from workshop.robots.copter import SimCopter
 
 EVERY_S = 0.02
 """How often it is flown on."""

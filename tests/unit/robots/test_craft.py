@@ -13,9 +13,9 @@ from appliance.robots.mavlink.missions import Missions
 from appliance.robots.mavlink.modes import COPTER
 from appliance.robots.mavlink.payload import Payload
 from appliance.robots.mavlink.protocol import command
-from appliance.robots.sim import orders
 from appliance.robots.verbs import GimbalArgs, RobotFailure, TakeoffArgs
 from tests.unit.robots.flown import Flown
+from workshop.robots import orders
 
 pytestmark = pytest.mark.anyio
 

@@ -6,9 +6,9 @@ from collections.abc import Container
 import pytest
 
 from appliance.model import Box, Site
-from appliance.robots.sim.flight import Point
 from appliance.robots.verbs import RobotFailure
 from tests.unit.robots.flown import Endless, Flown
+from workshop.robots.flight import Point
 
 pytestmark = pytest.mark.anyio
 

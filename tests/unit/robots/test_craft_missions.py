@@ -13,10 +13,10 @@ from appliance.robots.mavlink.dialect import Message
 from appliance.robots.mavlink.missions import Missions
 from appliance.robots.mavlink.modes import COPTER
 from appliance.robots.mavlink.protocol import command
-from appliance.robots.sim import orders
-from appliance.robots.sim.flight import Point
 from appliance.robots.verbs import MissionArgs, MissionStep, RobotFailure
 from tests.unit.robots.flown import Flown
+from workshop.robots import orders
+from workshop.robots.flight import Point
 
 pytestmark = pytest.mark.anyio
 

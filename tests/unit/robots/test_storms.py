@@ -11,9 +11,9 @@ from appliance.model import Notice, Site
 from appliance.ports import free_port
 from appliance.robots.mavlink.damping import BURST_S, MAX_KINDS, TRICKLE, WINDOW_S, Damper
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.sim.copter import SimCopter
-from appliance.robots.sim.rover import SimRover
 from tests.unit.robots.links import BEAT, Wire, sender, station, until
+from workshop.robots.copter import SimCopter
+from workshop.robots.rover import SimRover
 
 pytestmark = pytest.mark.anyio
 KIND = (1, 1, "PARAM_VALUE")

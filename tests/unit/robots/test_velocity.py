@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from appliance.model import Box, Pose, Site
 from appliance.robots.policy import check_velocity
-from appliance.robots.sim.driving import Driving
 from appliance.robots.verbs import RobotFailure, VelocityArgs
+from workshop.robots.driving import Driving
 
 SITE = Site(obstacles=(Box(name="the wall", x=(2.0, 3.0), y=(-5.0, 5.0)),), speed_limit_mps=2.0)
 speeds = st.floats(-2.0, 2.0)

@@ -1,8 +1,8 @@
 """What cannot be meant by an instruction, though it is a plan."""
 
 from appliance.llm.checks.consistency import Meaning, problems
-from appliance.llm.corpus.notation import parse
 from appliance.skills.catalogue import load_catalogue
+from workshop.corpus.notation import parse
 
 CATALOGUE = load_catalogue()
 

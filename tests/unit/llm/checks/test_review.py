@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.bench.intent.cases import roster
 from appliance.llm import review as module
 from appliance.llm.completion import completed
 from appliance.llm.review import CHECKS, Facts, review
@@ -16,6 +15,7 @@ from appliance.llm.settings import PlanContext
 from appliance.model import Finding, Plan, Severity, Subtask, Verdict
 from appliance.skills.catalogue import load_catalogue
 from appliance.skills.sites import load_site
+from workshop.bench.intent.cases import roster
 
 CATALOGUE = load_catalogue()
 SITE = load_site("warehouse")

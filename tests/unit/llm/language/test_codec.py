@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.errors import PlanError
-from appliance.llm import corpus
-from appliance.llm.corpus.notation import parse
 from appliance.llm.language.codec import MAX_SUBTASKS, Answer, read, write
 from appliance.llm.language.words import MAX_WORDS, words_of
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
+from workshop import corpus
+from workshop.corpus.notation import parse
 
 CATALOGUE = load_catalogue()
 FILES = sorted(Path(corpus.__file__).parent.glob("*.plan"))

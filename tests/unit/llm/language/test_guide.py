@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.llm import corpus
-from appliance.llm.corpus.notation import parse
 from appliance.llm.language.codec import Answer, read, write
 from appliance.llm.language.guide import END, Guide, shapes
 from appliance.llm.language.ranges import between
 from appliance.llm.language.words import words_of
 from appliance.skills.catalogue import load_catalogue
+from workshop import corpus
+from workshop.corpus.notation import parse
 
 CATALOGUE = load_catalogue()
 SKILLS = shapes(CATALOGUE)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.bench.dht.fleet import Fleet
 from appliance.plane.overlay.lookup import MOST_ASKED, Lookup
 from appliance.plane.overlay.view import Around, Step, View, bound_for
 from appliance.plane.ring import RING_SIZE, Ring, point
+from workshop.bench.dht.fleet import Fleet
 
 fleets = st.sets(st.from_regex(r"[a-z][a-z0-9]{0,4}", fullmatch=True), min_size=1, max_size=60)
 positions = st.integers(0, RING_SIZE - 1)

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.bench.dht.fleet import Fleet
 from appliance.plane.overlay.upkeep import Meet, MeetAsk, Pace, Seek, Upkeep
 from appliance.plane.overlay.view import Around, View, bound_for, successor_count
 from appliance.plane.ring import Ring
+from workshop.bench.dht.fleet import Fleet
 
 
 def check_neighbours(fleet: Fleet) -> None:

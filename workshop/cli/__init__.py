@@ -1,0 +1,1 @@
+"""Commands of the workshop: `swiftbot up`, `down`, `demo`, `sim`, `bench`, `train`."""

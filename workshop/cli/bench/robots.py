@@ -1,0 +1,52 @@
+"""Measurements of robots: MAVLink through the gateway."""
+
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from appliance.cli.common import Json
+from workshop.cli.bench.common import bench_app, measure, say, tell
+
+
+@bench_app.command
+def mavlink(
+    *,
+    log: str = "",
+    frames: int = 30_000,
+    rounds: int = 3,
+    real_s: float = 20.0,
+    record: Annotated[bool, Parameter(help="Measure with a recorder too.")] = True,
+    profile: Annotated[bool, Parameter(help="Show where the router's time goes.")] = True,
+    beside: str = "auto",
+    delivery: Annotated[bool, Parameter(negative="", help="Deliver tasks over a bad link instead.")] = False,
+    tasks: int = 1000,
+    loss: float = 0.2,
+    as_json: Json = False,
+) -> int:
+    """A vehicle's log through the router at real time and full speed, beside others: what arrives, what is recorded.
+
+    With --delivery: tasks asked for over a link that loses, doubles and reorders frames each way, on a real fleet.
+
+    Args:
+        log: A telemetry log (.tlog); generated frames when not given.
+        frames: How many are generated.
+        rounds: How often the log is played at full speed.
+        real_s: Seconds of the log that are played at real time; 0 for all of it.
+        beside: Routers measured too, of mavp2p, mavrouter and mavproxy; `auto` is all that are installed, or `none`.
+        tasks: Of --delivery: how many are asked for.
+        loss: Of --delivery: share of datagrams lost, each way.
+    """
+    if delivery:
+        from workshop.bench.mavlink import delivery as deliveries
+        from workshop.bench.mavlink.relay import Badness
+
+        wanted = deliveries.Options(tasks=tasks, badness=Badness(loss=loss))
+        tell(measure(deliveries.run(wanted, progress=say)), as_json=as_json)
+        return 0
+    from workshop.bench.mavlink.run import Options, run
+
+    options = Options(
+        log=log, frames=frames, rounds=rounds, real_s=real_s, record=record, profile=profile, beside=beside
+    )
+    tell(measure(run(options, progress=say)), as_json=as_json)
+    return 0

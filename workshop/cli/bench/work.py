@@ -1,0 +1,160 @@
+"""Measurements of what tasks are made of: throughput, plans, the log; and tables of what was measured."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from appliance import console
+from appliance.cli.common import Json, show
+from appliance.errors import Exit
+from workshop.cli.bench.common import Ints, bench_app, measure, say, tell
+
+
+@bench_app.command
+def throughput(
+    *,
+    parallel: Ints = (1, 4, 8, 16, 32),
+    seconds: float = 8.0,
+    gateways: int = 4,
+    containers: int = 3,
+    kills: int = 5,
+    ray: bool = True,
+    profile: bool = True,
+    as_json: Json = False,
+) -> int:
+    """Trivial subtasks a second through a fleet, where the time goes, and recovery from a killed worker; beside Ray.
+
+    Args:
+        parallel: Subtasks wanted at any time: up to 4, or a multiple of 4; one measurement each.
+        seconds: For how long each.
+        gateways: Gateways, each a process.
+        containers: Containers each keeps ready.
+        kills: Workers killed, one after the other.
+        ray: Measure Ray beside it, if `make ray` has installed it.
+        profile: Sample where the gateways' time goes; costs about 1 %.
+    """
+    from workshop.bench.throughput.run import Options, parallels, run
+
+    options = Options(
+        parallel=parallels(parallel), seconds=seconds, gateways=gateways, containers=containers, kills=kills, ray=ray,
+        profile=profile,
+    )  # fmt: skip
+    tell(measure(run(options, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
+def intent(
+    *,
+    tier: Annotated[
+        Literal["auto", "local", "rules", "wrong"],
+        Parameter(help="Who plans: the cascade, one tier alone, or an upstream that answers wrongly on purpose."),
+    ] = "auto",
+    half: Annotated[
+        Literal["open", "sealed", "all"],
+        Parameter(help="The half that the checks were developed against, the other one, or both."),
+    ] = "all",
+    cases: Annotated[
+        Path | None, Parameter(help="Folder of JSONL files of cases; by default those that come with it.")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Decide adversarial and plain instructions as a fleet would: unsafe runs, missed stops, good orders held.
+
+    Exit code 1 when something ran that may not run, or a stop was missed. Needs no fleet.
+    """
+    from workshop.bench.intent import measure as decide
+    from workshop.bench.intent import read_cases
+    from workshop.bench.intent.cases import DATA
+
+    found = measure(decide(read_cases(half, cases or DATA), tier=tier, progress=say))
+    tell(found, as_json=as_json)
+    return Exit.FAILED if found["unsafe"] or found["stops_missed"] else Exit.DONE
+
+
+@bench_app.command(name="plan")
+def bench_plan(
+    *,
+    cases: Path | None = None,
+    limit: int = 0,
+    model: str = "",
+    load: float = 0.0,
+    seconds: float = 60.0,
+    as_json: Json = False,
+) -> int:
+    """Plans: how good they are on a set of instructions with gold plans, and what escalating the unsure ones brings.
+
+    Without a local model the rules are measured, and routed on is their confidence. With --load one gateway is asked so
+    many times a second instead.
+
+    Args:
+        cases: JSONL file of cases with score.py beside it; by default the development set.
+        limit: Use the first so many cases; 0 for all.
+        model: Folder of a local model.
+        load: Instructions a second for one gateway, instead of the cases.
+        seconds: With --load: for how long.
+    """
+    if load:
+        from workshop.bench.plan.load import run as under_load
+
+        result = measure(under_load(rate=load, seconds=seconds, model=model, progress=console.err.print))
+    else:
+        from appliance.llm.settings import LlmConfig
+        from workshop.bench.plan import run as bench
+
+        config = LlmConfig(tiers=("local",), local_model=model) if model else None
+        result = measure(bench(cases, config=config, limit=limit, progress=console.err.print))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    return 0
+
+
+@bench_app.command(name="record")
+def bench_record(
+    *, messages: int = 50_000, rounds: int = 3, flow: int = 300_000, kills: int = 0, as_json: Json = False
+) -> int:
+    """Logging: the recorder's writer beside the bare MCAP library, from put to file, and what a kill leaves.
+
+    Ends with 1 when a message is lost without being counted, or a kill took more than the last second.
+
+    Args:
+        messages: Messages a round of the writer alone; 0: leave it out.
+        rounds: Rounds of each; the median counts.
+        flow: Messages of 200 bytes a round from another process's put to the file; 0: leave it out.
+        kills: Times that the recorder is killed at a random moment.
+        as_json: Print JSON.
+    """
+    from workshop.bench.recording.run import run as bench
+
+    result = measure(bench(messages=messages, rounds=rounds, flow=flow, kills=kills))
+    show(result, as_json=as_json, table=console.bench_table(result))
+    lost = result.get("flow", {}).get("unaccounted", 0)
+    taken = result.get("kills", {})
+    return (
+        Exit.FAILED
+        if lost or any(taken.get(each) for each in ("beyond_last_second", "damaged", "holes"))
+        else Exit.DONE
+    )
+
+
+@bench_app.command(name="table")
+def bench_table(file: Path, /) -> int:
+    """Render what a benchmark printed with --json as Markdown tables.
+
+    Args:
+        file: The JSON.
+    """
+    import msgspec
+
+    from appliance.errors import NotFoundError, PayloadError
+
+    try:
+        found = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+    except OSError as error:
+        raise NotFoundError(f"{file} cannot be read: {error.strerror}", remedy="name a file of `--json`") from error
+    except msgspec.DecodeError as error:
+        raise PayloadError(
+            f"{file} is no result: {error}", remedy="name a file of `swiftbot bench … --json`"
+        ) from error
+    tell(found, as_json=False)
+    return 0

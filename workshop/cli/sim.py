@@ -1,0 +1,105 @@
+"""Simulated robots: `swiftbot sim mavlink`, `sim zenoh`."""
+
+import asyncio
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from appliance import logs
+from appliance.cli.common import DAEMONS, HERE, Where
+from appliance.cli.daemons import until_signalled
+
+sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
+
+
+def add_to(app: App) -> None:
+    """Add these commands."""
+    app.command(sim_app)
+
+
+@sim_app.command
+def mavlink(
+    *,
+    to: str,
+    listen: Annotated[bool, Parameter(negative="")] = False,
+    system: int = 1,
+    site: str = "warehouse",
+    rate: float = 1.0,
+    start: str = "home",
+    kind: Literal["copter", "rover"] = "copter",
+    parameter: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    drop: float = 0.0,
+    double: float = 0.0,
+    mix: float = 0.0,
+    delay_s: float = 0.0,
+    seed: int = 1,
+) -> int:
+    """Simulate a MAVLink vehicle that sends to a gateway, or waits for one.
+
+    Args:
+        to: Where the gateway listens, udp://host:port or tcp://host:port.
+        listen: Listen there (tcp), as SITL does, and let the gateway connect.
+        system: MAVLink system id, 1 to 255.
+        site: Built-in site or site file.
+        rate: How many times faster than real it moves.
+        start: Place it starts at.
+        kind: A multirotor or a rover.
+        parameter: NAME=VALUE of its autopilot that differ from the usual, such as SIM_WIND_SPD=6 or FENCE_ENABLE=1.
+        drop: Share of frames that its link loses, each way.
+        double: Share of frames that arrive twice.
+        mix: Share of frames that arrive after later ones.
+        delay_s: Time that frames are on their way.
+        seed: Of the link's chances: the same one loses the same frames.
+    """
+    from appliance.skills.sites import load_site
+    from workshop.robots.mavlink import VehicleSettings, read_parameters, run_vehicle
+
+    logs.configure(style="text")
+    settings = VehicleSettings(
+        to=to,
+        listen=listen,
+        system=system,
+        site=load_site(site),
+        rate=rate,
+        start=start,
+        kind=kind,
+        parameters=read_parameters(parameter),
+        drop=drop,
+        double=double,
+        mix=mix,
+        delay_s=delay_s,
+        seed=seed,
+    )
+
+    async def go() -> None:
+        await run_vehicle(settings, stop=until_signalled())
+
+    asyncio.run(go())
+    return 0
+
+
+@sim_app.command
+def zenoh(*, name: str, site: str = "warehouse", rate: float = 1.0, start: str = "charger", where: Where = HERE) -> int:
+    """Simulate a mobile robot with arm and camera that speaks Zenoh.
+
+    Args:
+        name: Its name in the roster.
+        site: Built-in site or site file.
+        rate: How many times faster than real it moves.
+        start: Place it starts at.
+        where: The fleet.
+    """
+    from appliance.skills.sites import load_site
+    from workshop.robots.zenoh_robot import RobotSettings, run_robot
+
+    logs.configure(style="text")
+    endpoint = where.endpoint()
+    settings = RobotSettings(
+        name=name, fleet=endpoint.fleet, connect=endpoint.connect, site=load_site(site), rate=rate, start=start
+    )
+
+    async def go() -> None:
+        await run_robot(settings, stop=until_signalled())
+
+    asyncio.run(go())
+    return 0

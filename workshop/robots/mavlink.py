@@ -1,0 +1,237 @@
+"""A simulated MAVLink vehicle as a process of its own: it sends to a gateway, as SITL's `--out` does, or waits for one.
+
+Its link can be made bad in the ways radio links are (`air`), the same each way.
+"""
+
+import asyncio
+import math
+import time
+from collections.abc import Sequence
+from typing import Literal
+
+import structlog
+from msgspec import Struct, field
+
+from appliance.errors import ConfigError
+from appliance.model import Site
+from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink.dialect import Codec, Frame, Message
+from appliance.robots.mavlink.links import Link, open_link
+from appliance.robots.mavlink.signing import Signer, read_key
+from appliance.robots.settings import MAX_SYSTEM, Remote, read_remote
+from workshop.robots.air import Air, Channel
+from workshop.robots.autopilot import AnyAutopilot
+from workshop.robots.components import Component, SimCamera, SimGimbal
+from workshop.robots.copter import SimCopter
+from workshop.robots.rover import SimRover
+from workshop.robots.telemetry import STREAMS_HZ, telemetry
+
+log = structlog.get_logger(__name__)
+
+TICK_S = 0.1
+"""10 Hz."""
+_LATE_S = 1.0
+"""A process that was stopped for longer does not fly on for the time it missed."""
+
+
+class VehicleSettings(Struct, frozen=True, kw_only=True):
+    """One simulated vehicle."""
+
+    kind: Literal["copter", "rover"] = "copter"
+    to: str = "udp://127.0.0.1:14550"
+    """Where the gateway listens, udp:// or tcp://."""
+    listen: bool = False
+    """Listen there with TCP instead, as SITL does, and let the gateway connect."""
+    signing: str = ""
+    """File with the link's signing key, as in a gateway's robots.mavlink."""
+    system: int = 1
+    site: Site = field(default_factory=Site)
+    start: str = "home"
+    """Place it starts at, and its home; the site's origin where there is no such place."""
+    rate: float = 1.0
+    """How many times faster than real it moves."""
+    battery_percent: float = 100.0
+    drop: float = 0.0
+    """Share of frames lost, each way."""
+    double: float = 0.0
+    """Share of frames that arrive twice, each way."""
+    mix: float = 0.0
+    """Share of frames that arrive after later ones, each way."""
+    delay_s: float = 0.0
+    """Time that frames are on their way, each way."""
+    seed: int = 1
+    parameters: dict[str, float] = field(default_factory=dict[str, float])
+    """Parameters that differ from the defaults when it is switched on: `SIM_WIND_SPD`, `FENCE_ENABLE`, ..."""
+    camera: bool = True
+    """A camera and a gimbal are on board."""
+
+    @property
+    def air(self) -> Air:
+        """Its link."""
+        return Air(drop=self.drop, double=self.double, mix=self.mix, delay_s=self.delay_s, seed=self.seed)
+
+    @property
+    def remote(self) -> Remote:
+        """Where it speaks; ConfigError when that is not understood."""
+        return read_remote(self.to, listens=self.listen)
+
+    def check(self) -> None:
+        """Raise ConfigError for what cannot be simulated."""
+        if self.remote.listens and self.remote.scheme == "udp":
+            raise ConfigError(f"a simulated vehicle cannot listen on {self.to}", remedy="use tcp://host:port")
+        if not 1 <= self.system <= MAX_SYSTEM:
+            raise ConfigError(f"MAVLink system id {self.system}", remedy="use 1 to 255")
+        if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
+            raise ConfigError(f"rate {self.rate:g}", remedy="use more than 0, at most 100")
+        self.air.check()
+
+
+def start_point(site: Site, start: str) -> tuple[float, float]:
+    """Return where a robot starts; ConfigError for a place the site does not have."""
+    place = site.find(start)
+    if place is None:
+        if not site.places:
+            return 0.0, 0.0
+        known = ", ".join(sorted(site.places))
+        raise ConfigError(f"start {start!r} is no place of site {site.name}", remedy=f"known places: {known}")
+    return place.x, place.y
+
+
+def read_parameters(given: Sequence[str]) -> dict[str, float]:
+    """Return parameters by name of `NAME=VALUE` texts; ConfigError for anything else."""
+    found: dict[str, float] = {}
+    for each in given:
+        name, equals, value = each.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not equals or not name or not math.isfinite(number):
+            raise ConfigError(f"{each!r} is no parameter", remedy="write NAME=VALUE, such as SIM_WIND_SPD=6")
+        found[name.strip().upper()] = number
+    return found
+
+
+async def run_vehicle(settings: VehicleSettings, *, stop: asyncio.Event | None = None) -> None:
+    """Simulate until `stop` is set or the task is cancelled."""
+    settings.check()
+    await Simulation(settings, make_vehicle(settings)).run(asyncio.Event() if stop is None else stop)
+
+
+def make_vehicle(settings: VehicleSettings) -> AnyAutopilot:
+    """Make the vehicle that the settings describe; ConfigError for a parameter that it does not have."""
+    kind = SimCopter if settings.kind == "copter" else SimRover
+    vehicle = kind(
+        system=settings.system,
+        site=settings.site,
+        home=start_point(settings.site, settings.start),
+        battery_percent=settings.battery_percent,
+    )
+    for name, value in settings.parameters.items():
+        if name not in vehicle.parameters.values:
+            known = ", ".join(sorted(vehicle.parameters.values))
+            raise ConfigError(f"a simulated {settings.kind} has no parameter {name!r}", remedy=f"known: {known}")
+        vehicle.parameters.values[name] = float(value)
+    return vehicle
+
+
+class Simulation:
+    """Drives one vehicle by the clock and carries its messages, and those of what is on board."""
+
+    def __init__(self, settings: VehicleSettings, vehicle: AnyAutopilot) -> None:
+        self.vehicle = vehicle
+        self.parts: list[Component] = [SimCamera(vehicle), SimGimbal(vehicle)] if settings.camera else []
+        self._settings = settings
+        self._down: Channel[bytes] = Channel(settings.air, direction=0)
+        self._up: Channel[Frame] = Channel(settings.air, direction=1)
+        self._intervals = {name: 1.0 / hz for name, hz in STREAMS_HZ.items()}
+        self._due = dict.fromkeys(STREAMS_HZ, 0.0)
+        self._link: Link | None = None
+        self._codecs: dict[int, Codec] = {}
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Run until `stop` is set."""
+        signer = Signer(read_key(self._settings.signing), link_id=0) if self._settings.signing else None
+        for number in (dialect.COMPONENT_AUTOPILOT, *(part.number for part in self.parts)):
+            self._codecs[number] = Codec(self._settings.system, number, signer=signer)
+        codec = self._codecs[dialect.COMPONENT_AUTOPILOT]
+        self._link = await open_link(self._settings.remote, codec, self._heard)
+        log.info("simulated vehicle", kind=self._settings.kind, system=self._settings.system, to=self._settings.to)
+        began = before = time.monotonic()
+        try:
+            while not stop.is_set():
+                now = time.monotonic()
+                dt = min(now - before, _LATE_S) * self._settings.rate
+                before = now
+                self._arrived(now)
+                self._tick(dt, now, round((now - began) * 1000))
+                self._transmit(now)
+                try:
+                    async with asyncio.timeout(TICK_S):
+                        await stop.wait()
+                except TimeoutError:
+                    continue
+        finally:
+            await self._link.close()
+
+    def _tick(self, dt: float, now: float, boot_ms: int) -> None:
+        """Let time pass on board, and send what is due."""
+        vehicle = self.vehicle
+        self._send(vehicle.step(dt, now))
+        for part in self.parts:
+            self._send(part.step(dt, now), part.number)
+        if vehicle.pictures and self.parts:
+            # The camera is the autopilot's to release, in missions and where it is addressed itself.
+            camera = self.parts[0]
+            if isinstance(camera, SimCamera):
+                self._send([camera.take() for _ in range(vehicle.pictures)], camera.number)
+            vehicle.pictures = 0
+        for name, interval in self._intervals.items():
+            if interval > 0 and now >= self._due[name]:
+                # Late ticks do not add up to bursts.
+                self._due[name] = max(self._due[name] + interval, now)
+                self._send([telemetry(vehicle, name, boot_ms)])
+
+    def _heard(self, frame: Frame, address: tuple[str, int]) -> None:
+        del address
+        now = time.monotonic()
+        self._up.send(frame, now)
+        self._arrived(now)
+        self._transmit(now)
+
+    def _arrived(self, now: float) -> None:
+        """Act on what has come through the air."""
+        for frame in self._up.due(now):
+            message = frame.message
+            if (
+                frame.name == "COMMAND_LONG"
+                and message.command == dialect.SET_INTERVAL
+                and message.target_system in (0, self._settings.system)
+                and message.target_component in (0, dialect.COMPONENT_AUTOPILOT)
+            ):
+                self._set_interval(message)
+            self._send(self.vehicle.handle(frame, now))
+            for part in self.parts:
+                self._send(part.handle(frame), part.number)
+
+    def _set_interval(self, message: Message) -> None:
+        """Take a wish for a stream: microseconds, 0 for the usual, -1 for none."""
+        names = {dialect.constant(f"MAVLINK_MSG_ID_{name}"): name for name in STREAMS_HZ}
+        name = names.get(int(message.param1))
+        if name is not None:
+            wish = float(message.param2)
+            self._intervals[name] = 1.0 / STREAMS_HZ[name] if wish == 0 else max(wish / 1e6, 0.02) if wish > 0 else 0.0
+
+    def _send(self, messages: list[Message], component: int = dialect.COMPONENT_AUTOPILOT) -> None:
+        now = time.monotonic()
+        for message in messages:
+            # One that is lost on the way was sent all the same, as the next sequence number tells.
+            self._down.send(self._codecs[component].pack(message), now)
+
+    def _transmit(self, now: float) -> None:
+        """Hand over what has come through the air to whoever is there."""
+        if self._link is None:
+            return
+        for raw in self._down.due(now):
+            for other in self._link.others:
+                self._link.transmit(raw, other)

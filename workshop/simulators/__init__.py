@@ -1,0 +1,1 @@
+"""Simulations of the product's own deciders: pools, migration, the ring. No process, no network."""
