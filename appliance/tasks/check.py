@@ -25,7 +25,8 @@ from appliance.record.reader import read
 from appliance.tasks import machine
 from appliance.tasks.decided import PlacementCase, place_again
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind
-from appliance.tasks.replay import TAKES_OVER, compare
+from appliance.tasks.replay import compare
+from appliance.tasks.transition import TAKES_OVER, fingerprint
 
 MOST_SHOWN = 100
 """Differences kept; the first is what matters, the others mostly follow from it."""
@@ -103,14 +104,14 @@ class _Task:
         self.lines: dict[str, list[TaskRecord]] = {}
         """Coordinator -> the record as it follows; several while it is open which version it has taken over."""
         self.history: dict[int, dict[str, TaskRecord]] = {}
-        """Sequence -> the versions with that many transitions, by their coordinator."""
+        """Sequence -> the versions with that many transitions, by their fingerprint."""
         self.guessed: set[str] = set()
         """Coordinators whose line goes on from a version that may be another than theirs."""
 
     def remember(self, records: list[TaskRecord]) -> None:
         """Note where a line stands."""
         for record in records[:MOST_VERSIONS]:
-            self.history.setdefault(record.sequence, {})[record.coordinator] = record
+            self.history.setdefault(record.sequence, {})[fingerprint(record)] = record
         self.lines[records[0].coordinator] = records[:MOST_VERSIONS]
         if len(self.history) > MOST_HISTORY:
             del self.history[next(iter(self.history))]
@@ -120,6 +121,9 @@ class _Task:
         own = [each for each in self.lines.get(event.coordinator, ()) if each.sequence == event.sequence - 1]
         if event.kind not in TAKES_OVER:
             return own
+        if event.base:
+            exact = self.history.get(event.sequence - 1, {}).get(event.base)
+            return [] if exact is None else [exact]
         line = self.lines.get(event.coordinator, ())
         if not own and line and all(each.sequence < event.sequence - 1 for each in line):
             # It had a line of its own, of which something is not in the log: others that are as long may not be its.

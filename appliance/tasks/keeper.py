@@ -17,6 +17,7 @@ from appliance.tasks.bounds import read_record
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.remedies import remedied
 from appliance.tasks.surroundings import task_key
+from appliance.tasks.transition import TAKES_OVER, fingerprint
 from appliance.tasks.unknown import Unknown, with_unknown
 
 
@@ -94,6 +95,8 @@ class Keeper:
         """Return the next transition of the record; a failure in it without a remedy is given that of its code."""
         if (failure := fields.get("failure")) is not None:
             fields["failure"] = remedied(failure, self.record.id)
+        if kind in TAKES_OVER:
+            fields["base"] = fingerprint(self.record)
         return Transition(
             task=self.record.id,
             sequence=self.record.sequence + 1,

@@ -16,6 +16,7 @@ from appliance.model import SubtaskRecord, TaskRecord
 from appliance.record.reader import read
 from appliance.tasks import machine
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind
+from appliance.tasks.transition import TAKES_OVER, fingerprint
 
 
 class TaskReplay(Struct, frozen=True, kw_only=True):
@@ -46,16 +47,14 @@ class ReplayReport(Struct, frozen=True, kw_only=True):
     same: bool = False
 
 
-TAKES_OVER = (TransitionKind.ADOPTED, TransitionKind.HEALED, TransitionKind.RETRIED)
-"""What a coordinator may begin with where another has been: a task that has ended is only healed, or tried again."""
-
-
 class _Folding:
     """One task while the log is read."""
 
     def __init__(self) -> None:
         self.record: TaskRecord | None = None
         self.history: dict[int, TaskRecord] = {}
+        self.versions: dict[str, TaskRecord] = {}
+        """By fingerprint: what a takeover may go on from."""
         self.logged: TaskRecord | None = None
         self.transitions = 0
         self.stale = 0
@@ -68,7 +67,9 @@ class _Folding:
             # Of the other side of a partition, or of one that was succeeded and does not know it yet.
             self.stale += 1
             return
-        if event.kind is TransitionKind.ADOPTED and base is not None:
+        if event.base in self.versions:
+            base = self.versions[event.base]
+        elif event.kind is TransitionKind.ADOPTED and base is not None:
             # The new coordinator goes on from the last *written* record; progress since then is not in it.
             base = self.history.get(event.sequence - 1, base)
         try:
@@ -79,6 +80,7 @@ class _Folding:
                 self.gaps.append(f"gap before transition {event.sequence} ({event.kind}): {error.message}")
             return
         self.history[event.sequence] = self.record
+        self.versions[fingerprint(self.record)] = self.record
 
 
 def replay(path: Path) -> ReplayReport:

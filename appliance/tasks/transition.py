@@ -1,5 +1,6 @@
 """The inputs of the task state machine: what can happen to a task, as it is published and logged."""
 
+import hashlib
 from enum import StrEnum
 from typing import Any
 
@@ -17,6 +18,7 @@ from appliance.model import (
     Phase,
     Plan,
     Split,
+    TaskRecord,
     Word,
 )
 
@@ -131,6 +133,21 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """On `cancel` and `retried`: who, and why."""
     cpu_ms: float | None = None
     peak_mb: float | None = None
+    base: str = ""
+    """Of a takeover (`TAKES_OVER`): fingerprint of the record it was applied to. Two coordinators can have written as
+    many transitions; a log is checked against the right one."""
+
+
+TAKES_OVER = (TransitionKind.ADOPTED, TransitionKind.HEALED, TransitionKind.RETRIED)
+"""What a coordinator may begin with where another has been: a task that has ended is only healed, or tried again."""
+
+
+def fingerprint(record: TaskRecord) -> str:
+    """Return 16 hexadecimal digits that tell a version of a task from others with as many transitions."""
+    parts = [record.id, str(record.sequence), record.coordinator, record.state, str(record.revised)]
+    for each in record.subtasks:
+        parts += [each.subtask.id, each.state, str(each.attempt), each.gateway, each.bound_robot or ""]
+    return hashlib.blake2b("\0".join(parts).encode(), digest_size=8).hexdigest()
 
 
 class StaleTransitionError(SwiftbotError):

@@ -36,6 +36,7 @@ from appliance.tasks.decided import Asked, placement_case
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import place
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.transition import fingerprint
 
 KEYS = Keys("f")
 PLAN = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="goto"),))
@@ -173,6 +174,27 @@ def test_a_side_whose_last_step_is_missing_is_not_taken_for_the_other(tmp_path: 
     assert isinstance(last, TaskRecord)
     wrong = replace(last, subtasks=(replace(last.subtasks[0], gateway="gw-9"),))
     assert not check([write(tmp_path / "c.mcap", [*told[:-1], (key, wrong)])]).same
+
+
+def test_a_takeover_is_followed_from_the_version_that_it_names(tmp_path: Path) -> None:
+    """Several coordinators wrote as many transitions: the version named counts; if it is missing, none does."""
+    shared = STEPS[:3]
+    lost = {**STEPS[3][1], "give_up": False}
+    side = history(*shared, (TransitionKind.ADOPTED, {"coordinator": "gw-2"}))
+    other = history(*shared, (TransitionKind.ATTEMPT_FAILED, lost))
+    base = other[-1][1]
+    assert isinstance(base, TaskRecord)
+    taken = history(
+        *shared,
+        (TransitionKind.ATTEMPT_FAILED, lost),
+        (TransitionKind.ADOPTED, {"coordinator": "gw-3", "base": fingerprint(base)}),
+    )[-2:]
+    whole = check([write(tmp_path / "whole.mcap", [*other, *side[-2:], *taken])])
+    assert whole.same, whole.divergences
+    assert not whole.unchecked
+    missing = check([write(tmp_path / "missing.mcap", [*side, *taken])])
+    assert missing.same, missing.divergences
+    assert missing.unchecked == {"after what is not in the log": 1, "record after what is not in the log": 1}
 
 
 def _placed(config: TasksConfig) -> Struct:
