@@ -48,8 +48,8 @@ from appliance.record.heard import Recorders
 from appliance.robot_tasks import RobotTasks
 from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.authority.authority import SHOWN, Authority
-from appliance.robots.bounds import Orders
 from appliance.robots.hub import RobotHub
+from appliance.robots.limits import Orders
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
 from appliance.state_here import StateHere

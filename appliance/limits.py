@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from appliance.config import GatewayConfig
 from appliance.llm.checks.policy import strictest
 from appliance.model import RobotInfo, Site
-from appliance.robots.bounds import Bounds, Orders, Usual
+from appliance.robots.limits import Bounds, Orders, Usual
 
 
 def orders_of(config: GatewayConfig, site: Site, *, roster: Callable[[], Mapping[str, RobotInfo]]) -> Orders:

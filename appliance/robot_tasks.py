@@ -13,7 +13,7 @@ from appliance.errors import RefusedError, SwiftbotError
 from appliance.llm.safety.settings import SafetyConfig
 from appliance.model import TaskRecord, TaskRequest
 from appliance.plane.node import Plane
-from appliance.robots.doors import Tasks
+from appliance.robots.task_listener import Tasks
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.bounds import clean
 from appliance.tasks.manager import TaskManager

@@ -26,7 +26,7 @@ from appliance.model import (
     TaskState,
     encode,
 )
-from appliance.robots.authority.api import (
+from appliance.robots.api import (
     LEASE_S,
     DriveAsk,
     GiveAsk,
@@ -38,7 +38,7 @@ from appliance.robots.authority.api import (
     StopAsk,
     TakeAsk,
 )
-from appliance.robots.authority.telling import tell_to_hold
+from appliance.robots.sender import tell_to_hold
 from appliance.tasks.steering.api import (
     ActList,
     ActsAsk,

@@ -12,7 +12,7 @@ from msgspec import Struct
 from appliance.errors import DeadlineError, UnreachableError
 from appliance.llm.stop_words import stop_request
 from appliance.model.steering import MAX_STOPPED, MAX_WHY
-from appliance.robots.authority.api import StopAnswer
+from appliance.robots.api import StopAnswer
 from appliance.steering import SteeringCalls
 
 

@@ -11,7 +11,7 @@ from appliance.cli.common import HERE, Json, Where, show
 from appliance.cli.robots import robots_app
 from appliance.client import FleetClient
 from appliance.model import Lease, RobotReply
-from appliance.robots.authority.api import LEASE_S
+from appliance.robots.api import LEASE_S
 
 STEP_S = 0.5
 

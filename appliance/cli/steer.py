@@ -18,7 +18,7 @@ from appliance.cli.work import task_app
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, Exit, SwiftbotError
 from appliance.model import Plan, TaskRecord
-from appliance.robots.authority.api import StopAnswer
+from appliance.robots.api import StopAnswer
 from appliance.steering import read_plan_file
 from appliance.tasks.view import view
 

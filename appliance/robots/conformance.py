@@ -21,8 +21,8 @@ from appliance.errors import DeadlineError, RobotError, SwiftbotError, Unreachab
 from appliance.model import Pose, RobotCommand, RobotInfo, RobotReply, encode
 from appliance.model.plausible import plausible, read_robot
 from appliance.plane.session import Session
-from appliance.robots.commands import UNREADABLE
-from appliance.robots.patience import FIRST_SILENCE_S, LONG_POLL_S
+from appliance.robots.executor import UNREADABLE
+from appliance.robots.retry import FIRST_SILENCE_S, LONG_POLL_S
 
 WATCH_S = 4.0
 """How long the robot's state is listened to."""

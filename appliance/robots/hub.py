@@ -13,13 +13,12 @@ from appliance.errors import NotFoundError, RefusedError
 from appliance.model import RobotCommand, RobotInfo, Site, TaskRequest
 from appliance.plane.session import Session
 from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
-from appliance.robots.doors import Tasks
-from appliance.robots.intake import TaskIntake
-from appliance.robots.ledger import KeyValues
+from appliance.robots.executor import KeyValues
 from appliance.robots.settings import RobotsConfig
+from appliance.robots.task_listener import TaskListener, Tasks
 
 if TYPE_CHECKING:
-    from appliance.robots.mavlink.station import Station
+    from appliance.robots.mavlink.vehicle_manager import VehicleManager
 
 
 log = structlog.get_logger(__name__)
@@ -57,8 +56,8 @@ class RobotHub:
         self._tasks = tasks
         self.refused: dict[str, int] = {}
         submit = None if tasks is None else tasks.submit_of
-        self._intake = None if on_task is None else TaskIntake(session, on_task, self.refused, submit=submit)
-        self._station: Station | None = None
+        self._intake = None if on_task is None else TaskListener(session, on_task, self.refused, submit=submit)
+        self._station: VehicleManager | None = None
         self._opening = asyncio.Lock()
 
     @property
@@ -79,9 +78,9 @@ class RobotHub:
             if self._station is not None:
                 return self._station
             # pymavlink's dialect costs 15 MB and 30 ms: only gateways with vehicles pay for it.
-            from appliance.robots.mavlink.station import Station  # noqa: PLC0415
+            from appliance.robots.mavlink.vehicle_manager import VehicleManager  # noqa: PLC0415
 
-            station = Station(
+            station = VehicleManager(
                 self._config,
                 session=self._session,
                 store=self._store,

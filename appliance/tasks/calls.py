@@ -22,8 +22,8 @@ from appliance.model import Notice, RobotCommand, RobotReply, encode
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.pool.pool import Call
-from appliance.robots.bounds import CHOSEN
-from appliance.robots.sending import send_command
+from appliance.robots.limits import CHOSEN
+from appliance.robots.sender import send_command
 from appliance.tasks.api import ArtifactAsk, ArtifactPiece
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.bounds import MAX_RUN_S, clean

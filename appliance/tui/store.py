@@ -28,7 +28,7 @@ from appliance.model import (
 )
 from appliance.plane.once import Once
 from appliance.record.facts import RecorderStatus
-from appliance.robots.authority.stops import Stops
+from appliance.robots.authority.soft_stop import Stops
 from appliance.tui.safe import safe
 from appliance.tui.shelf import Shelf
 

@@ -26,7 +26,7 @@ from appliance.model import ContainerState, Phase, RobotCommand, SubtaskState, T
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
 from appliance.robots.client import TaskClient, TaskRejected
-from appliance.robots.mavlink.requests import task_number
+from appliance.robots.mavlink.command_server import task_number
 from appliance.robots.settings import RobotsConfig, Template
 from appliance.robots.zenoh_client import AsyncZenohTaskClient, ZenohTaskRejected
 from appliance.tasks.replay import replay

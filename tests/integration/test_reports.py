@@ -22,8 +22,7 @@ from appliance.client import FleetClient
 from appliance.errors import SwiftbotError
 from appliance.model import RobotInfo
 from appliance.robots.api import LinkRemove
-from appliance.robots.mavlink.dialect import Codec, make
-from appliance.robots.mavlink.kinds import KINDS, checksum
+from appliance.robots.mavlink.dialect import KINDS, Codec, checksum, make
 from appliance.robots.settings import RobotsConfig, Template
 from appliance.robots.zenoh_client import ZenohTaskClient, ZenohTaskRejected
 

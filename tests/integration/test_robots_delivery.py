@@ -14,9 +14,9 @@ from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 from appliance.robots.api import LinkAdd, LinksAsk
 from appliance.robots.client import AsyncZenohTaskClient
-from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
 from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.task_listener import Tasks
 from workshop.bench.mavlink.delivery import answers, ask_all
 from workshop.bench.mavlink.relay import BadLink, Badness
 

@@ -19,7 +19,7 @@ from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 from appliance.robots.hub import RobotHub
 from appliance.robots.mavlink.dialect import Codec, make
-from appliance.robots.sending import send_command
+from appliance.robots.sender import send_command
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from workshop.robots.mavlink import VehicleSettings
 

@@ -32,9 +32,9 @@ from appliance.model import (
 )
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.robots import patience
-from appliance.robots.intake import TaskIntake
-from appliance.robots.sending import send_command
+from appliance.robots import retry
+from appliance.robots.sender import send_command
+from appliance.robots.task_listener import TaskListener
 from workshop.robots.zenoh_robot import RobotSettings
 
 pytestmark = pytest.mark.anyio
@@ -310,7 +310,7 @@ async def test_bad_input_is_answered(hall: Hall) -> None:
 
 async def test_an_unknown_robot_is_unreachable(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
     """A command for a robot that nobody speaks for ends with the remedy."""
-    monkeypatch.setattr(patience, "UNREACHABLE_S", 0.5)
+    monkeypatch.setattr(retry, "UNREACHABLE_S", 0.5)
     with pytest.raises(UnreachableError, match="no answer from robot rover_9"):
         await hall.tell("rover_9", "state")
 
@@ -345,7 +345,7 @@ async def test_tasks_of_robots_reach_the_gateway(hall: Hall) -> None:
     """A TaskRequest put by a robot is handed over with its name; what is none is counted."""
     client = await Session.open(PlaneConfig(mode="client", connect=(hall.endpoint,)), "hall")
     asked: list[tuple[str, TaskRequest]] = []
-    intake = TaskIntake(hall.session, lambda robot, request: asked.append((robot, request)))
+    intake = TaskListener(hall.session, lambda robot, request: asked.append((robot, request)))
     intake.start()
     try:
 

@@ -41,10 +41,10 @@ from appliance.model.geo import to_globe
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.robots.doors import Tasks
 from appliance.robots.hub import RobotHub
-from appliance.robots.mavlink.requests import task_number
+from appliance.robots.mavlink.command_server import task_number
 from appliance.robots.settings import MavlinkLink, RobotsConfig, Template
+from appliance.robots.task_listener import Tasks
 from workshop.bench.mavlink import others
 from workshop.robots.mavlink import VehicleSettings
 

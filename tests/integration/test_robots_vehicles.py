@@ -16,7 +16,7 @@ from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 from appliance.robots.hub import RobotHub
-from appliance.robots.sending import hold_robot, send_command
+from appliance.robots.sender import hold_robot, send_command
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from workshop.robots.mavlink import VehicleSettings
 

@@ -25,7 +25,7 @@ from appliance.model import (
     TaskRequest,
     TaskState,
 )
-from appliance.robots.authority.api import StopAnswer
+from appliance.robots.api import StopAnswer
 from appliance.stopping import Named, named
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.steering.api import PlanChecked

@@ -36,8 +36,7 @@ from appliance.plane.versions import Record
 from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
 from appliance.records import Held
-from appliance.robots.api import LinkList
-from appliance.robots.authority.api import StopAnswer
+from appliance.robots.api import LinkList, StopAnswer
 from appliance.stopping import Stopped
 from appliance.tasks.api import ExperienceList, PlanAnswer
 from appliance.tasks.watch.lines import Line

@@ -3,7 +3,7 @@
 from collections.abc import Awaitable, Callable
 
 from appliance.model import Pose
-from appliance.robots.commands import Done, Verb
+from appliance.robots.executor import Done, Verb
 from appliance.robots.verbs import AskArgs, GiveArgs, NamedArgs, RobotFailure, SayArgs
 from workshop.robots.world import CLOSED, HEARING_M, OFF, ON, OPEN, Thing, World, answer
 

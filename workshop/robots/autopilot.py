@@ -14,8 +14,8 @@ from appliance.model import Site
 from appliance.model.geo import to_globe, to_site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message, make
-from appliance.robots.mavlink.modes import Modes
-from appliance.robots.mavlink.texts import statustext
+from appliance.robots.mavlink.statustext import statustext
+from appliance.robots.mavlink.vehicle import Modes
 from workshop.robots import orders
 from workshop.robots.board import Board, Sender
 from workshop.robots.flight import Flight, Point

@@ -8,7 +8,7 @@ import math
 from appliance.model import Site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import COPTER_MODES, Message
-from appliance.robots.mavlink.modes import COPTER
+from appliance.robots.mavlink.vehicle import COPTER
 from workshop.robots import parameters
 from workshop.robots.autopilot import Autopilot
 from workshop.robots.flight import CLIMB_MPS, Flight, Point

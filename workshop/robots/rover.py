@@ -5,7 +5,7 @@ import math
 from appliance.model import Site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Message
-from appliance.robots.mavlink.modes import ROVER
+from appliance.robots.mavlink.vehicle import ROVER
 from workshop.robots import parameters
 from workshop.robots.autopilot import Autopilot
 from workshop.robots.flight import Point

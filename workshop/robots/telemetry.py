@@ -4,8 +4,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from appliance.model.geo import to_globe
-from appliance.robots.mavlink.condition import PREARM_CHECK
 from appliance.robots.mavlink.dialect import Message, constant, make
+from appliance.robots.mavlink.vehicle import PREARM_CHECK
 from workshop.robots.safety import arming_problems
 
 if TYPE_CHECKING:

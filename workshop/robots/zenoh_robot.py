@@ -24,9 +24,8 @@ from appliance.model.geo import blocked_leg
 from appliance.plane.keys import check_name
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.robots.commands import UNREADABLE, CommandDesk, Done, Verb
-from appliance.robots.ledger import Ledger
-from appliance.robots.policy import check_velocity, check_way
+from appliance.robots.executor import UNREADABLE, CommandExecutor, Done, IdempotencyLog, Verb
+from appliance.robots.limits import check_velocity, check_way
 from appliance.robots.verbs import (
     MAX_FRAMES,
     MAX_SIDE,
@@ -142,10 +141,10 @@ class Rover:
         self._around = Around(
             self.name, self.world, pose=lambda: self.driving.pose, wait=self._wait, announce=self._announce
         )
-        self.desk = CommandDesk(
+        self.desk = CommandExecutor(
             self.name,
             session=session,
-            ledger=Ledger(self.name),
+            ledger=IdempotencyLog(self.name),
             verbs=self._verbs(),
             ready=lambda: None,
             halt=self._halt,

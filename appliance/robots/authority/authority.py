@@ -14,7 +14,7 @@ import structlog
 from appliance.errors import SwiftbotError
 from appliance.model import Lease, RobotCommand, SoftStop
 from appliance.plane.node import Plane
-from appliance.robots.authority.api import (
+from appliance.robots.api import (
     DriveAsk,
     GiveAsk,
     RenewAsk,
@@ -25,8 +25,8 @@ from appliance.robots.authority.api import (
     StopAsk,
     TakeAsk,
 )
-from appliance.robots.authority.leasing import Leasing
-from appliance.robots.authority.stopping import Stopping
+from appliance.robots.authority.lease import Leasing
+from appliance.robots.authority.soft_stop import Stopping
 
 log = structlog.get_logger(__name__)
 

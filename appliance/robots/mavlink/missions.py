@@ -13,12 +13,12 @@ from itertools import pairwise
 
 import structlog
 
-from appliance.robots.commands import Done
-from appliance.robots.mavlink import dialect, parameters
-from appliance.robots.mavlink.craft import POLL_S, Craft, Point
+from appliance.robots.executor import Done
+from appliance.robots.limits import check_mission, check_orbit, check_points
+from appliance.robots.mavlink import dialect, protocols
+from appliance.robots.mavlink.controller import POLL_S, Point, VehicleController
 from appliance.robots.mavlink.dialect import Message, make
-from appliance.robots.mavlink.protocol import Item, Patience, accepted, ask, command, command_long, download, upload
-from appliance.robots.policy import check_mission, check_orbit, check_points
+from appliance.robots.mavlink.protocols import Item, RetryPolicy, accepted, ask, command, command_long, download, upload
 from appliance.robots.verbs import MissionArgs, MissionStep, OrbitArgs, RobotFailure, Waypoint, cruise
 
 log = structlog.get_logger(__name__)
@@ -39,7 +39,7 @@ ACTS = {
 class Missions:
     """Makes, uploads and flies missions of one craft."""
 
-    def __init__(self, craft: Craft) -> None:
+    def __init__(self, craft: VehicleController) -> None:
         self._craft = craft
 
     # --- verbs -------------------------------------------------------------------------------------------------
@@ -254,9 +254,9 @@ class Missions:
 
     async def _begins_anew(self) -> bool:
         """Whether entering the mode begins the mission anew (ArduPilot's MIS_RESTART); False where it is not told."""
-        patience = Patience(timeout_s=self._craft.patience.timeout_s, tries=_ASKED)
+        patience = RetryPolicy(timeout_s=self._craft.patience.timeout_s, tries=_ASKED)
         try:
-            return await parameters.read(self._craft.vehicle, "MIS_RESTART", patience=patience) != 0
+            return await protocols.read(self._craft.vehicle, "MIS_RESTART", patience=patience) != 0
         except RobotFailure:
             return False  # another autopilot, or a lossy link: `_stay_at` sees to it
 

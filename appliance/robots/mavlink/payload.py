@@ -9,12 +9,12 @@ import asyncio
 import math
 import secrets
 
-from appliance.robots.commands import Done, Verb
-from appliance.robots.mavlink import dialect, texts
-from appliance.robots.mavlink.craft import Craft
+from appliance.robots.executor import Done, Verb
+from appliance.robots.mavlink import dialect, statustext
+from appliance.robots.mavlink.controller import VehicleController
 from appliance.robots.mavlink.dialect import Message, constant, make
-from appliance.robots.mavlink.protocol import ask, command, command_at
-from appliance.robots.mavlink.said import MAX_PARTS, PART
+from appliance.robots.mavlink.protocols import ask, command, command_at
+from appliance.robots.mavlink.statustext import MAX_PARTS, PART
 from appliance.robots.verbs import (
     GimbalArgs,
     GripperArgs,
@@ -50,7 +50,7 @@ _TUNE = "MFT200L16<cdefgab>cdefgab"
 class Payload:
     """Of one craft."""
 
-    def __init__(self, craft: Craft) -> None:
+    def __init__(self, craft: VehicleController) -> None:
         self._craft = craft
         self._manager: int | None = None
 
@@ -258,7 +258,7 @@ class Payload:
                 tune2=tune[30:],
             )
         )
-        for each in texts.parts(data, _NOTICE):
+        for each in statustext.parts(data, _NOTICE):
             vehicle.announce(each)
         return Done({"said": words, "tune": tune.decode(), "acknowledged": False} | self._craft.where())
 

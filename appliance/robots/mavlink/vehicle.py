@@ -1,24 +1,435 @@
-"""What a gateway knows of one MAVLink vehicle, and the way its messages reach whoever waits for them.
+"""What a gateway knows of one MAVLink vehicle: its mode, condition and track, and who commands it.
 
-State is only ever what the vehicle has said of itself; nothing is assumed from a command having been sent.
-`hear` takes a frame and the time and does no I/O, so that logs can be played through it.
+Its messages reach from here whatever waits for them. State is only ever what the vehicle has said of itself; nothing
+is assumed from a command having been sent, and nothing concluded from silence. `hear` takes a frame and the time and
+does no I/O, so that logs can be played through it.
+
+Modes: MAVLink tells them as a number that means something else for each kind of vehicle (ArduCopter/mode.h,
+Rover/mode.h). A vehicle of a kind that is not here is watched and not commanded: an order to a mode that means
+something else there is an accident.
+
+Condition: what estimator, battery, fence and failsafes say, as flags in words (EKF_STATUS_REPORT, ESTIMATOR_STATUS,
+FENCE_STATUS, BATTERY_STATUS, HEARTBEAT.system_status, SYS_STATUS).
+
+Track: positions told of late, each with the time at which the vehicle says that it was there. A gateway may look seldom
+and a radio may hold reports back, so neither the time of looking nor that of hearing tells how far a vehicle went
+between two positions.
+
+Control authority: the gateway, a person at the vehicle, or its own failsafes. A gateway that goes on commanding while a
+pilot has taken the sticks fights with them. So it notices: a mode that it did not order, sticks moved over the gateway
+(RC_CHANNELS_OVERRIDE, MANUAL_CONTROL), a failsafe in force. The vehicle is then *seized*: the command in progress fails
+with the reason, further ones are refused, and nothing that the gateway does of its own accord changes the mode. It is
+given back by whoever took it (the mode that the gateway had ordered, or the guided mode, is chosen again; the motors
+are off; the failsafe is over), or taken back by an operator (`release`). A gateway that has just started, or a vehicle
+that has just been armed, has no order yet that a mode could be measured by; but a gateway never orders a mode in which
+sticks move a vehicle, so whoever chose that one has it. On the ground with the motors off nothing is seized: there a
+mode is a setting.
 """
 
 import asyncio
 import math
+from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
+
+from msgspec import Struct
 
 from appliance.model import Pose, RobotInfo, Site
 from appliance.model.geo import to_site
 from appliance.model.plausible import plausible_altitude, plausible_battery, plausible_item, plausible_place
 from appliance.robots.mavlink import dialect
-from appliance.robots.mavlink.condition import Condition
-from appliance.robots.mavlink.control import Control
 from appliance.robots.mavlink.dialect import Frame, Message
-from appliance.robots.mavlink.modes import Modes, modes_of
-from appliance.robots.mavlink.said import WARNING, Said, Texts
-from appliance.robots.mavlink.track import Report, Track
+from appliance.robots.mavlink.statustext import REFUSAL_SEVERITY, Said, Texts
+
+
+class Modes(Struct, frozen=True, kw_only=True):
+    """The modes of a kind of vehicle, and which of them the gateway uses for what."""
+
+    numbers: dict[str, int]
+    guided: str = "GUIDED"
+    """Goes where it is told, and stays where it is when it has been told nothing."""
+    mission: str = "AUTO"
+    home: str = "RTL"
+    land: str = ""
+    """Empty: it does not fly."""
+    follows: dict[str, frozenset[str]] = {}
+    """Modes that the autopilot itself goes on to from another, without anybody having taken over."""
+    by_hand: frozenset[str] = frozenset()
+    """Modes in which a person's sticks, or hands, move it. GUIDED_NOGPS and FOLLOW are not: a computer does."""
+    plain: frozenset[str] = frozenset()
+    """Modes that anybody who commands it may choose: it stays, goes home, comes down, or waits for orders. In others it
+    goes where nobody has checked that it may (AUTO flies whatever mission is on board), or does tricks."""
+
+    def name(self, number: int) -> str:
+        """Return a mode's name, its number where it has none."""
+        return next((name for name, each in self.numbers.items() if each == number), str(number))
+
+
+COPTER = Modes(
+    numbers={
+        **dialect.COPTER_MODES,
+        "ACRO": 1,
+        "CIRCLE": 7,
+        "DRIFT": 11,
+        "SPORT": 13,
+        "FLIP": 14,
+        "AUTOTUNE": 15,
+        "THROW": 18,
+        "GUIDED_NOGPS": 20,
+        "FLOWHOLD": 22,
+        "FOLLOW": 23,
+        "ZIGZAG": 24,
+        "AUTO_RTL": 27,
+    },
+    land="LAND",
+    follows={"RTL": frozenset({"LAND"}), "SMART_RTL": frozenset({"RTL", "LAND"}), "BRAKE": frozenset({"LOITER"})},
+    by_hand=frozenset(
+        {
+            "STABILIZE",
+            "ACRO",
+            "ALT_HOLD",
+            "LOITER",
+            "POSHOLD",
+            "DRIFT",
+            "SPORT",
+            "FLOWHOLD",
+            "FLIP",  # out of a mode flown by hand, and back to it
+            "AUTOTUNE",
+            "ZIGZAG",
+            "CIRCLE",  # sticks change radius, speed and height; a circle that the gateway flies is a mission
+            "THROW",  # armed in somebody's hand
+        }
+    ),
+    plain=frozenset({"GUIDED", "BRAKE", "LAND", "RTL", "SMART_RTL"}),
+)
+ROVER = Modes(
+    numbers={
+        "MANUAL": 0,
+        "ACRO": 1,
+        "STEERING": 3,
+        "HOLD": 4,
+        "LOITER": 5,
+        "FOLLOW": 6,
+        "SIMPLE": 7,
+        "AUTO": 10,
+        "RTL": 11,
+        "SMART_RTL": 12,
+        "GUIDED": 15,
+    },
+    follows={"RTL": frozenset({"HOLD"}), "SMART_RTL": frozenset({"RTL", "HOLD"})},
+    by_hand=frozenset({"MANUAL", "ACRO", "STEERING", "SIMPLE"}),
+    plain=frozenset({"GUIDED", "HOLD", "LOITER", "RTL", "SMART_RTL"}),
+)
+GROUND = frozenset({dialect.constant("MAV_TYPE_GROUND_ROVER"), dialect.constant("MAV_TYPE_SURFACE_BOAT")})
+"""What ArduRover drives."""
+
+
+def modes_of(autopilot: int, kind: int) -> Modes | None:
+    """Return the modes of a vehicle by its heartbeat (MAV_AUTOPILOT, MAV_TYPE), None when they are not known here."""
+    if autopilot != dialect.AUTOPILOT_ARDUPILOT:
+        return None
+    if kind in dialect.MULTIROTORS:
+        return COPTER
+    return ROVER if kind in GROUND else None
+
+
+_ESTIMATOR = {
+    0x01: "no attitude",
+    0x02: "no horizontal velocity",
+    0x04: "no vertical velocity",
+    0x10: "no position",
+    0x20: "no height",
+}
+"""Bits of EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS, which agree on them, and what it means that one is missing."""
+_RELATIVE = 0x08
+"""A position relative to the start stands in for an absolute one."""
+_CONST_POSITION = 0x80
+_GLITCH = 0x400
+_CRITICAL, _EMERGENCY, _TERMINATING = (
+    dialect.constant(f"MAV_STATE_{name}") for name in ("CRITICAL", "EMERGENCY", "FLIGHT_TERMINATION")
+)
+_CHARGE = {2: "battery low", 3: "battery critical", 4: "battery emergency", 5: "battery failed", 6: "battery unhealthy"}
+"""MAV_BATTERY_CHARGE_STATE."""
+_LOW_IS_NO_FAILSAFE = frozenset({"battery low"})
+_FENCE = {1: "below the fence's floor", 2: "above the fence's ceiling", 3: "outside the fence"}
+"""FENCE_BREACH."""
+PREARM_CHECK = dialect.constant("MAV_SYS_STATUS_PREARM_CHECK")
+
+
+class Condition:
+    """Flags of one vehicle. `hear` returns whether any of them changed."""
+
+    def __init__(self) -> None:
+        self.estimator: tuple[str, ...] = ()
+        """What the estimator does not know, empty when it is well or has said nothing."""
+        self.estimating = False
+        """It has said something."""
+        self.prearm: bool | None = None
+        """Whether the autopilot would arm; None when it does not say."""
+        self._state = ""
+        self._charge = ""
+        self._fence = ""
+
+    @property
+    def failsafe(self) -> str:
+        """The failsafes in force in words, empty when there is none."""
+        charge = "" if self._charge in _LOW_IS_NO_FAILSAFE else self._charge
+        return ", ".join(each for each in (self._state, charge, self._fence) if each)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is not well and no failsafe."""
+        return (self._charge,) if self._charge in _LOW_IS_NO_FAILSAFE else ()
+
+    def hear(self, name: str, message: Message) -> bool:
+        """Take in a message of the autopilot."""
+        before = (self.estimator, self.failsafe, self.warnings, self.prearm)
+        match name:
+            case "HEARTBEAT":
+                self._state = _STATES.get(int(message.system_status), "")
+            case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
+                self.estimating = True
+                self.estimator = estimator(int(message.flags))
+            case "BATTERY_STATUS":
+                if message.id == 0:
+                    self._charge = _CHARGE.get(int(getattr(message, "charge_state", 0)), "")
+            case "FENCE_STATUS":
+                self._fence = _FENCE.get(int(message.breach_type), "fence breached") if message.breach_status else ""
+            case "SYS_STATUS":
+                if message.onboard_control_sensors_enabled & PREARM_CHECK:
+                    self.prearm = bool(message.onboard_control_sensors_health & PREARM_CHECK)
+            case _:
+                return False
+        return before != (self.estimator, self.failsafe, self.warnings, self.prearm)
+
+
+_STATES = {_CRITICAL: "failsafe", _EMERGENCY: "emergency", _TERMINATING: "flight termination"}
+
+
+class Summary(Struct, frozen=True):
+    """What of it goes into the roster."""
+
+    estimator: tuple[str, ...]
+    failsafe: str
+
+
+def estimator(flags: int) -> tuple[str, ...]:
+    """Return in words what an estimator's flags say is missing or wrong."""
+    missing = [
+        words
+        for bit, words in _ESTIMATOR.items()
+        if not flags & bit and not (bit == 0x10 and flags & _RELATIVE and not flags & _CONST_POSITION)
+    ]
+    if flags & _CONST_POSITION and "no position" not in missing:
+        missing.append("no position")
+    if flags & _GLITCH:
+        missing.append("GPS glitch")
+    return tuple(missing)
+
+
+OVERRIDES = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})
+"""Messages by which a ground station moves a vehicle's sticks."""
+
+STICKS_S = 3.0
+"""Overrides come several times a second; after so long without one the sticks are let go."""
+_REST = 60
+"""Sticks are never quite in the middle: microseconds, or thousandths."""
+_MIDDLE_US = 1500
+_NO_CHANNEL = frozenset({0, 65535})
+_NO_AXIS = 32767
+CHANGE_S = 15.0
+"""A mode that was ordered is to be taken up within so long; before, the old one is no takeover."""
+
+
+class PilotOverride(Struct, frozen=True):
+    """Who has the vehicle, and why, in words."""
+
+    by: str
+    """`pilot` or `failsafe`."""
+    why: str
+
+
+class Control:
+    """Of one vehicle; times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self.seized: PilotOverride | None = None
+        self._own: int | None = None
+        """The mode in which it is the gateway's: ordered and taken up, or what it was taken back in; None: none yet."""
+        self._wanted: int | None = None
+        """The mode of a change in flight."""
+        self._wanted_at = 0.0
+        self._passing: frozenset[int] = frozenset()
+        """Modes that may show until the change has been taken up: the one before, and changes ordered before it."""
+        self._sticks_at: float | None = None
+        self._failsafe = ""
+        self._mode: int | None = None
+        self._armed = False
+
+    def order(self, mode: int, now: float) -> None:
+        """Note that the gateway asks for a mode."""
+        if self._wanted is None and mode in (self._own, self._mode):
+            self._own = mode
+            return
+        # While another change is in flight the mode heard last says nothing: it may still be taken up.
+        before = {each for each in (self._own, self._mode, self._wanted) if each is not None}
+        self._passing = frozenset(before) | (self._passing if self._wanted is not None else frozenset())
+        self._wanted, self._wanted_at = mode, now
+
+    def hear(self, mode: int, armed: bool, failsafe: str, modes: Modes | None, now: float) -> bool:
+        """Take in what a heartbeat says; returns whether the seizure changed.
+
+        Args:
+            mode: custom mode.
+            armed: whether the motors are on.
+            failsafe: failsafes in force in words.
+            modes: of this kind of vehicle; None: they are not known, and nothing is decided.
+            now: monotonic seconds.
+        """
+        before = self.seized
+        landed = self._armed and not armed
+        self._mode, self._armed, self._failsafe = mode, armed, failsafe
+        if modes is None:
+            return False
+        if not armed:
+            self._rest(mode, landed=landed)
+            return before is not None
+        if self._sticks_at is not None and now - self._sticks_at > STICKS_S:
+            self._sticks_at = None
+        given_back = mode in (self._own, self._wanted, modes.numbers[modes.guided])
+        if self.seized is not None and given_back and not failsafe and self._sticks_at is None:
+            self.seized = None
+            # Where nothing was ordered yet there is still nothing that a mode could be measured by.
+            ordered = self._own is not None or self._wanted is not None
+            self._settle(mode if ordered else None)
+        elif self.seized is None:
+            self.seized = self._look(mode, modes, now)
+        elif self.seized.by == "pilot" and failsafe:
+            self.seized = PilotOverride("failsafe", _failsafe(failsafe, modes.name(mode)))
+        return before != self.seized
+
+    def _rest(self, mode: int, *, landed: bool) -> None:
+        """Nobody has it while its motors are off; what the gateway orders for the next flight counts."""
+        self.seized, self._sticks_at = None, None
+        if landed:
+            self._own, self._wanted = None, None
+        elif mode == self._wanted:
+            self._settle(mode)
+        elif mode != self._own:
+            self._own = None
+
+    def _settle(self, mode: int | None) -> None:
+        self._own, self._wanted, self._passing = mode, None, frozenset()
+
+    def sticks(self, system: int, moved: bool, now: float) -> bool:
+        """Take in an override that passed the gateway on its way to the vehicle; returns whether it is a seizure."""
+        if not moved:
+            return False
+        self._sticks_at = now
+        if not self._armed or self.seized is not None:
+            return False
+        self.seized = PilotOverride("pilot", f"somebody moves its sticks from system {system}")
+        return True
+
+    def release(self) -> PilotOverride | None:
+        """Let an operator take it back; returns who had it. A failsafe in force seizes it again at once."""
+        before, self.seized, self._sticks_at = self.seized, None, None
+        # The mode it is in is not the one ordered before: it is the starting point of what comes next.
+        self._settle(self._mode)
+        return before
+
+    def _look(self, mode: int, modes: Modes, now: float) -> PilotOverride | None:
+        name = modes.name(mode)
+        if self._failsafe:
+            return PilotOverride("failsafe", _failsafe(self._failsafe, name))
+        if self._wanted is not None:
+            wanted = modes.name(self._wanted)
+            if mode == self._wanted or name in modes.follows.get(wanted, frozenset()):
+                self._settle(self._wanted)
+            elif not self._may_show(mode, name, modes):
+                return _changed(wanted, name)
+            elif now - self._wanted_at <= CHANGE_S:
+                return None
+            else:
+                # It was not taken up: what it stays in is the starting point of what comes next.
+                self._settle(self._own if name in modes.by_hand else mode)
+        if self._own is None:
+            why = f"it is armed in {name}, where sticks move it, and this gateway did not choose that"
+            return PilotOverride("pilot", why) if name in modes.by_hand else None
+        own = modes.name(self._own)
+        follows = mode == self._own or name in modes.follows.get(own, frozenset())
+        return None if follows else _changed(own, name)
+
+    def _may_show(self, mode: int, name: str, modes: Modes) -> bool:
+        """Whether a mode may show while a change is in flight, without anybody but the gateway having chosen it.
+
+        What was in force or ordered before may, with what the autopilot goes on to from its own mode by itself; the
+        guided mode may, in which a pilot hands over.
+        """
+        before = "" if self._own is None else modes.name(self._own)
+        return mode in self._passing or name == modes.guided or name in modes.follows.get(before, frozenset())
+
+
+def _changed(before: str, now: str) -> PilotOverride:
+    return PilotOverride("pilot", f"its mode was changed from {before} to {now}, not by this gateway")
+
+
+def moved(name: str, message: Message) -> bool:
+    """Whether an override holds a stick away from its middle; joysticks at rest are sent all the time."""
+    if name == "MANUAL_CONTROL":
+        return any(abs(value) > _REST for value in (message.x, message.y, message.r) if value != _NO_AXIS)
+    channels = (message.chan1_raw, message.chan2_raw, message.chan4_raw)
+    return any(abs(value - _MIDDLE_US) > _REST for value in channels if value not in _NO_CHANNEL)
+
+
+def _failsafe(words: str, mode: str) -> str:
+    return f"{words}: it is in {mode}" if words == "failsafe" else f"failsafe: {words}, it is in {mode}"
+
+
+_KEPT = 64
+"""Reports: six seconds at 10 Hz, far more than passes between two looks."""
+_CLOCK_MS = 2**32
+"""`time_boot_ms` has 32 bits and begins anew after 49.7 days."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A position, in site metres, as the vehicle told it."""
+
+    pose: Pose
+    boot_ms: int
+    """Milliseconds of the vehicle's own clock, which begins when it starts."""
+    heard_at: float
+    """Monotonic seconds."""
+
+
+def apart_s(one: Report, other: Report) -> float:
+    """Return the seconds from one report to a later one by the vehicle's clock; by ours where its clock stands.
+
+    A clock that went back (a restart, or a report that was overtaken) gives weeks: what was between is not known.
+    """
+    passed_ms = (other.boot_ms - one.boot_ms) % _CLOCK_MS
+    return passed_ms / 1000.0 if passed_ms else other.heard_at - one.heard_at
+
+
+class Track:
+    """The last reports of one vehicle, in the order in which they came."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Reports so far, those that are no longer kept too."""
+        self._reports: deque[Report] = deque(maxlen=_KEPT)
+
+    def take(self, report: Report) -> None:
+        """Add a report."""
+        self._reports.append(report)
+        self.count += 1
+
+    def since(self, count: int) -> list[Report]:
+        """Return the reports that came after so many, behind the last one before them."""
+        return list(self._reports)[-(self.count - count + 1) :]
+
 
 Address = tuple[str, int]
 
@@ -256,7 +667,7 @@ class Vehicle:
         return fits
 
     def _said(self, said: Said) -> None:
-        if said.severity <= WARNING:
+        if said.severity <= REFUSAL_SEVERITY:
             self.text = said.text
 
     def _pass_on(self, frame: Frame) -> None:

@@ -5,7 +5,7 @@ import asyncio
 from appliance.model import Site
 from appliance.model.geo import to_globe
 from appliance.robots.mavlink import dialect
-from appliance.robots.mavlink.craft import Craft
+from appliance.robots.mavlink.controller import VehicleController
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import RobotsConfig
@@ -28,7 +28,7 @@ class Flown:
         """Whether time stands still for what flies; it answers and tells of itself all the same."""
         self._up, self._down = Codec(242, 191), Codec(1, 1)
         self.vehicle = Vehicle("drone_1", site=Site(), send=self._send, own=242)
-        self.craft = Craft(self.vehicle, site=Site(), config=RobotsConfig(ack_timeout_s=0.2))
+        self.craft = VehicleController(self.vehicle, site=Site(), config=RobotsConfig(ack_timeout_s=0.2))
         self.vehicle.online = True
 
     def _send(self, message: Message) -> None:
@@ -98,6 +98,6 @@ class Endless:
         self.looks += 1
         return 100.0
 
-    async def travel(self, craft: Craft) -> None:
+    async def travel(self, craft: VehicleController) -> None:
         """Be under way."""
         await craft.travel("goto", "GUIDED", lambda: self.over is not None and self.looks >= self.over, self.left)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.model import Box, Pose, RobotCommand, RobotInfo, RobotLimits, Site
-from appliance.robots.bounds import CHOSEN, Bounds, Orders, Usual
+from appliance.robots.limits import CHOSEN, Bounds, Orders, Usual
 
 SITE = Site(
     fence=Box(name="the yard", x=(0.0, 40.0), y=(0.0, 30.0)),

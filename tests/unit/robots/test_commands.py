@@ -11,10 +11,9 @@ from msgspec.structs import replace
 
 from appliance.errors import ContractError, DeadlineError, PayloadError, RobotError, UnreachableError
 from appliance.model import Failure, RobotCommand, RobotReply, encode
-from appliance.robots import patience
-from appliance.robots.commands import CommandDesk, Done, Verb
-from appliance.robots.ledger import Ledger
-from appliance.robots.sending import send_command
+from appliance.robots import retry
+from appliance.robots.executor import CommandExecutor, Done, IdempotencyLog, Verb
+from appliance.robots.sender import send_command
 from appliance.robots.verbs import RobotFailure
 
 pytestmark = pytest.mark.anyio
@@ -41,8 +40,8 @@ class Robot:
         self.lease = "l"
         self.session = session
         self.refused: dict[str, int] = {}
-        self.ledger = Ledger("r", store)
-        self.desk = CommandDesk(
+        self.ledger = IdempotencyLog("r", store)
+        self.desk = CommandExecutor(
             "r",
             session=session,
             ledger=self.ledger,
@@ -302,7 +301,7 @@ async def test_lost_replies_and_restarts_are_asked_again(session: Any) -> None:
 
 async def test_nobody_answers(session: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot that nobody serves is UnreachableError with the remedy, well before a long deadline."""
-    monkeypatch.setattr(patience, "UNREACHABLE_S", 0.3)
+    monkeypatch.setattr(retry, "UNREACHABLE_S", 0.3)
     with pytest.raises(UnreachableError, match="swiftbot robots"):
         await send_command(session, "r", order("t/s1/1"), timeout_s=60.0)
 
@@ -352,7 +351,7 @@ async def test_a_robot_that_is_there_and_does_not_answer_breaks_the_contract(
     session: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The error says which robot, which verb, how long and how often; it is told to stop, and has a check."""
-    monkeypatch.setattr(patience, "UNREACHABLE_S", 0.5)
+    monkeypatch.setattr(retry, "UNREACHABLE_S", 0.5)
     session.alive = True
     with pytest.raises(ContractError, match=r"robot r did not answer goto for \d s \(asked \d times\)") as caught:
         await send_command(session, "r", order("t/s1/1"), timeout_s=60.0)
@@ -377,7 +376,7 @@ async def test_a_robot_that_does_again_what_it_has_done_is_told_so(
     session: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its second answer differs from the first: each question was carried out."""
-    monkeypatch.setattr(patience, "FIRST_SILENCE_S", 0.1)
+    monkeypatch.setattr(retry, "FIRST_SILENCE_S", 0.1)
     free, done = asyncio.Lock(), itertools.count()
 
     async def answer(payload: bytes) -> bytes:

@@ -3,9 +3,9 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.robots.mavlink.condition import PREARM_CHECK, Condition, estimator
 from appliance.robots.mavlink.dialect import Message, make
-from appliance.robots.mavlink.said import KEPT, PART, Texts
+from appliance.robots.mavlink.statustext import KEPT, PART, Texts
+from appliance.robots.mavlink.vehicle import PREARM_CHECK, Condition, estimator
 
 WELL = 0b11_0011_1111
 BATTERY = {

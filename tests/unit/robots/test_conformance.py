@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PayloadError, UnreachableError
 from appliance.model import Failure, Pose, RobotInfo, RobotReply, encode
-from appliance.robots import conformance, patience
+from appliance.robots import conformance, retry
 from appliance.robots.conformance import (
     Answer,
     Fault,
@@ -179,4 +179,4 @@ def test_the_page_of_the_contract_has_the_figures_of_the_code() -> None:
     ):
         assert text in page, text
     assert len(conformance.MALFORMED) == 6
-    assert patience.JITTER == 0.25
+    assert retry.JITTER == 0.25

@@ -4,9 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.robots.mavlink.control import CHANGE_S, STICKS_S, Control, moved
 from appliance.robots.mavlink.dialect import make
-from appliance.robots.mavlink.modes import COPTER, ROVER, modes_of
+from appliance.robots.mavlink.vehicle import CHANGE_S, COPTER, ROVER, STICKS_S, Control, modes_of, moved
 
 AUTO, GUIDED, LOITER, RTL, LAND, BRAKE, STABILIZE = (
     COPTER.numbers[name] for name in ("AUTO", "GUIDED", "LOITER", "RTL", "LAND", "BRAKE", "STABILIZE")

@@ -6,13 +6,12 @@ from typing import Any
 import pytest
 
 from appliance.robots.mavlink import dialect
-from appliance.robots.mavlink.control import Seizure
-from appliance.robots.mavlink.copter import Copter
+from appliance.robots.mavlink.command_dispatcher import Copter
 from appliance.robots.mavlink.dialect import Message
 from appliance.robots.mavlink.missions import Missions
-from appliance.robots.mavlink.modes import COPTER
 from appliance.robots.mavlink.payload import Payload
-from appliance.robots.mavlink.protocol import command
+from appliance.robots.mavlink.protocols import command
+from appliance.robots.mavlink.vehicle import COPTER, PilotOverride
 from appliance.robots.verbs import GimbalArgs, RobotFailure, TakeoffArgs
 from tests.unit.robots.flown import Flown
 from workshop.robots import orders
@@ -111,12 +110,12 @@ async def test_a_failsafe_keeps_it_from_all_but_what_is_safe(flown: Flown, monke
     await flown.arm()
     control = flown.vehicle.control
     monkeypatch.setattr(control, "hear", lambda *_: False)
-    control.seized = Seizure("failsafe", "battery critical")
+    control.seized = PilotOverride("failsafe", "battery critical")
     with pytest.raises(RobotFailure, match="battery critical"):
         await flown.craft.mode("BRAKE")
     await flown.craft.mode("LAND", safe=True)
     assert flown.vehicle.mode == "LAND"
-    control.seized = Seizure("pilot", "somebody flies it")
+    control.seized = PilotOverride("pilot", "somebody flies it")
     with pytest.raises(RobotFailure, match="somebody flies it"):
         await flown.craft.mode("RTL", safe=True)
 

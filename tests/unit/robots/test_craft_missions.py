@@ -11,8 +11,8 @@ from appliance.model import Box, Pose, Site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Message
 from appliance.robots.mavlink.missions import Missions
-from appliance.robots.mavlink.modes import COPTER
-from appliance.robots.mavlink.protocol import command
+from appliance.robots.mavlink.protocols import command
+from appliance.robots.mavlink.vehicle import COPTER
 from appliance.robots.verbs import MissionArgs, MissionStep, RobotFailure
 from tests.unit.robots.flown import Flown
 from workshop.robots import orders

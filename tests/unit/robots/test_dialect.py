@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v10 import ardupilotmega as v1_dialect
 from pymavlink.dialects.v20 import ardupilotmega
 
-from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Stream, constant, label, make
-from appliance.robots.mavlink.kinds import KINDS
+from appliance.robots.mavlink.dialect import KINDS, Codec, Damage, Frame, Stream, constant, label, make
 from appliance.robots.mavlink.signing import Signer
 
 _CODEC = Codec(7, 1)

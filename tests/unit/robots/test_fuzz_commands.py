@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Struct
 
-from appliance.robots.mavlink.requests import REPEAT_S
+from appliance.robots.mavlink.command_server import REPEAT_S
 from tests.unit.robots.conftest import FakeStore
 from tests.unit.robots.test_repetitions import Timed
 from tests.unit.robots.test_requests import ACCEPTED, DENIED, IN_PROGRESS

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.ports import free_port
-from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Stream, make
-from appliance.robots.mavlink.kinds import KINDS, checksum, decode
+from appliance.robots.mavlink.dialect import KINDS, Codec, Damage, Frame, Stream, checksum, decode, make
 from appliance.robots.mavlink.signing import Signer
 from appliance.robots.mavlink.tunnel import MAX_GOING, MAX_PAYLOAD, PART, PAYLOAD_TYPE
 from tests.unit.robots.links import (

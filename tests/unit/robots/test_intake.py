@@ -6,7 +6,7 @@ import pytest
 from appliance.errors import PayloadError
 from appliance.model import Plan, Provenance
 from appliance.plane.session import Message
-from appliance.robots.intake import MAX_BYTES, read_request
+from appliance.robots.task_listener import MAX_BYTES, read_request
 
 
 def message(payload: bytes, at_ns: int = 5_000_000_000) -> Message:

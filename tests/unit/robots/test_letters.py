@@ -21,10 +21,10 @@ from appliance.model import (
     TaskState,
     Tier,
 )
-from appliance.robots.doors import Tasks
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.letters import Answer, LetterDesk
 from appliance.robots.mavlink.tunnel import GIVE_UP_S, MAX_GOING, MAX_PAYLOAD, PAYLOAD_TYPE, Channel
+from appliance.robots.mavlink.tunnel_rpc import Answer, TunnelServer
+from appliance.robots.task_listener import Tasks
 
 pytestmark = pytest.mark.anyio
 
@@ -41,7 +41,7 @@ class Air:
         self.error: SwiftbotError | None = None
         self.refused: dict[str, int] = {}
         doors = Tasks(submit=self.submit, cancel=lambda task, _: self.look(task), look=self.look) if tasks else None
-        self.desk = LetterDesk(tasks=doors, refused=self.refused, clock=lambda: self.now)
+        self.desk = TunnelServer(tasks=doors, refused=self.refused, clock=lambda: self.now)
         self.robot = Channel(itertools.count(7).__next__)
         self.codec, self.reader = Codec(1, 192), Codec(245, 191)
         self.up: list[tuple[float, bytes]] = []

@@ -13,7 +13,7 @@ from appliance.model import Site
 from appliance.ports import free_port
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.signing import Signer
-from appliance.robots.mavlink.station import Station
+from appliance.robots.mavlink.vehicle_manager import VehicleManager
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from tests.unit.robots.conftest import FakeStore
 from tests.unit.robots.links import (
@@ -219,7 +219,7 @@ async def test_a_recorded_signed_link_played_again(tmp_path: Any) -> None:
     recorded: list[bytes] = []
     for _ in range(2):
         refused: dict[str, int] = {}
-        made = Station(
+        made = VehicleManager(
             RobotsConfig(mavlink=(MavlinkLink(listen=f"udp://127.0.0.1:{port}", signing=str(key)),), repeat_s=0.0),
             session=cast("Any", Wire()), store=store, gateway="gw-1", site=Site(), refused=refused,
         )  # fmt: skip

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
 from appliance.ports import free_port
-from appliance.robots.mavlink import texts
+from appliance.robots.mavlink import statustext
 from appliance.robots.mavlink.dialect import Codec, Frame, make
-from appliance.robots.mavlink.said import Said, Texts
+from appliance.robots.mavlink.statustext import Said, Texts
 from appliance.robots.settings import MavlinkLink
 from tests.unit.robots.links import BEAT, station, until
 from tests.unit.robots.test_silent_stations import ear
@@ -35,21 +35,21 @@ def heard(*raws: bytes) -> list[Said]:
 def test_any_text_is_ended_and_whole_or_ends_with_an_ellipsis(text: str) -> None:
     """A station that waits for a part that is not full has it at once, and sees that something was cut."""
     codec = Codec(242, 191)
-    (said,) = heard(*(codec.pack(each) for each in texts.statustext(text, texts.ERROR)))
-    if len(text) <= texts.MOST:
+    (said,) = heard(*(codec.pack(each) for each in statustext.statustext(text, statustext.ERROR)))
+    if len(text) <= statustext.MOST:
         assert said.text == text.strip()
     else:
         assert said.text.endswith("...")
         assert text.startswith(said.text.removesuffix("...").rstrip()) or text.strip().startswith(
             said.text[:-3].strip()
         )
-        assert len(said.text) <= texts.MOST
+        assert len(said.text) <= statustext.MOST
 
 
 @pytest.mark.parametrize("size", [1, 50, 51, 100, 150, 199, 200])
 def test_a_text_whose_last_part_is_full_has_an_empty_one_behind(size: int) -> None:
     """But one of 50 characters, which is whole without an id."""
-    sent = texts.statustext("x" * size, texts.INFO)
+    sent = statustext.statustext("x" * size, statustext.INFO)
     sizes = [len(each.text.rstrip(b"\0") if isinstance(each.text, bytes) else each.text) for each in sent]
     assert sum(sizes) == size
     assert (sizes[-1] < 50) or (size == 50 and sent[0].id == 0)
@@ -68,7 +68,7 @@ def test_a_text_that_a_vehicle_does_not_end_is_told_after_a_while() -> None:
 
 def test_the_empty_part_has_no_form_in_mavlink_1() -> None:
     """There parts have no id: it would be shown as an empty text."""
-    sizes = [len(Codec(9, 1, v1=True).pack(each)) for each in texts.statustext("x" * 100, texts.INFO)]
+    sizes = [len(Codec(9, 1, v1=True).pack(each)) for each in statustext.statustext("x" * 100, statustext.INFO)]
     assert sizes == [59, 59, 0]
     assert len(Codec(9, 1, v1=True).pack(make("STATUSTEXT", severity=1, text=b"", id=0, chunk_seq=0))) == 59
     assert ardupilotmega.MAVLINK_MSG_ID_STATUSTEXT == 253
@@ -94,7 +94,7 @@ async def test_what_is_said_of_a_vehicle_comes_from_its_system(companion: bool) 
         ready = {(7, 1), (255, 190), *([(7, 191)] if companion else [])}
         await until(lambda: made.attached and ready <= made._switch.router.routes.keys(), act)
         (each,) = made._vehicles.values()
-        for part in texts.parts(b"y" * 60, texts.NOTICE):
+        for part in statustext.parts(b"y" * 60, statustext.NOTICE):
             each.vehicle.announce(part)
         for frames in (at_vehicle, at_ground):
             await until(lambda frames=frames: sum(each.name == "STATUSTEXT" for each in frames) == 2)

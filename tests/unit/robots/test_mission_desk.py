@@ -14,12 +14,11 @@ from appliance.errors import PayloadError
 from appliance.llm.checks.schema import validate
 from appliance.model import Box, Place, Plan, Site, TaskRecord, TaskRequest, TaskState
 from appliance.model.geo import to_globe
-from appliance.robots.doors import Tasks
+from appliance.robots.mavlink.command_server import CommandServer
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.mission_desk import MissionDesk
-from appliance.robots.mavlink.mission_plan import Item, UnfitItem, plan_of
-from appliance.robots.mavlink.requests import RequestDesk
+from appliance.robots.mavlink.mission_server import Item, MissionServer, UnfitItem, plan_of
 from appliance.robots.settings import RobotsConfig
+from appliance.robots.task_listener import Tasks
 from appliance.skills.catalogue import load_catalogue
 from tests.unit.robots.conftest import FakeStore
 
@@ -66,7 +65,7 @@ class Ground:
         self.acks: list[int] = []
         self.texts: list[str] = []
         config = RobotsConfig(**changes)
-        self.desk = MissionDesk(config, site=SITE, store=store, refused=self.refused, clock=lambda: self.now)
+        self.desk = MissionServer(config, site=SITE, store=store, refused=self.refused, clock=lambda: self.now)
 
     def tell(self, name: str, *, robot: str = "drone_1", source: tuple[int, int] = (255, 190), **fields: Any) -> None:
         """Send a message to the desk, over the bad link."""
@@ -227,7 +226,7 @@ async def test_what_is_accepted_may_run(store: FakeStore, items: list[Item]) -> 
     """The plan of a mission that was accepted has no problem: the same check looks at both."""
     site = replace(SITE, obstacles=(), forbidden=())
     ground = Ground(store)
-    ground.desk = MissionDesk(
+    ground.desk = MissionServer(
         RobotsConfig(), site=site, store=store, refused=ground.refused, clock=lambda: ground.now, problems=problems
     )
     assert await ground.upload(items) == ACCEPTED, ground.texts
@@ -238,7 +237,7 @@ async def test_what_is_accepted_may_run(store: FakeStore, items: list[Item]) -> 
 async def test_what_would_not_run_is_refused_with_the_reason_of_its_plan(store: FakeStore) -> None:
     """Whatever the check of plans has against a mission is said when it is uploaded, and nothing is held."""
     ground = Ground(store)
-    ground.desk = MissionDesk(
+    ground.desk = MissionServer(
         RobotsConfig(), site=SITE, store=store, refused=ground.refused, clock=lambda: ground.now, problems=problems
     )
     assert await ground.upload([item(WAYPOINT, 1 + number % 30, 4, 8.0, 1.0) for number in range(40)]) == NO_SPACE
@@ -362,7 +361,7 @@ class Fleet:
         self.state = TaskState.CANCELLING
         self.said: list[Message] = []
         tasks = Tasks(submit=self.submit, cancel=lambda task, _: self.cancel(task), look=self.cancel)
-        self.desk = RequestDesk((), tasks=tasks, store=store, refused={}, mission=self.ground.desk.request)
+        self.desk = CommandServer((), tasks=tasks, store=store, refused={}, mission=self.ground.desk.request)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
         """Take a task."""

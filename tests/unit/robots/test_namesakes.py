@@ -9,7 +9,7 @@ import pytest
 from appliance.model import RobotCommand, RobotInfo, RobotReply, encode
 from appliance.plane import roster as rosters
 from appliance.plane.roster import Roster
-from appliance.robots.sending import send_command
+from appliance.robots.sender import send_command
 from tests.unit.robots.conftest import FakeSession
 
 pytestmark = pytest.mark.anyio

@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.robots.patience import (
+from appliance.robots.retry import (
     CONFIRM_S,
     FIRST_SILENCE_S,
     LONG_POLL_S,
     SILENT_S,
     UNREACHABLE_S,
     Ask,
+    CommandRetry,
     Done,
     End,
     Ending,
-    Patience,
     Wait,
 )
 
@@ -37,7 +37,7 @@ class Course:
         self.now = 0.0
         self.sent: list[float] = []
         self.end: Ending | None = None
-        policy = Patience(0.0, timeout_s, live=live, chance=chance)
+        policy = CommandRetry(0.0, timeout_s, live=live, chance=chance)
         words: list[tuple[float, int, int, str, str]] = []
         order = itertools.count()
         first: str | None = None
@@ -184,7 +184,7 @@ def test_a_restart_in_between_is_waited_out() -> None:
 
 def test_a_refusal_that_is_not_kept_holds_at_once() -> None:
     """A robot that was busy may take the same command up when it is asked again: that is no second time."""
-    policy = Patience(0.0, TIMEOUT_S)
+    policy = CommandRetry(0.0, TIMEOUT_S)
     for now in (0.0, FIRST_SILENCE_S):
         assert isinstance(policy.next(now), Ask)
         policy.asked(now)

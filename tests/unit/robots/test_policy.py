@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Box, Pose, Site
-from appliance.robots.policy import breach, check_mission, check_orbit, check_points, check_way
+from appliance.robots.limits import breach, check_mission, check_orbit, check_points, check_way
 from appliance.robots.verbs import GotoArgs, MissionArgs, MissionStep, OrbitArgs, RobotFailure, Waypoint
 
 SITE = Site(

@@ -7,15 +7,15 @@ from typing import Any
 import pytest
 
 from appliance.model import Site
-from appliance.robots.mavlink import dialect, parameters
+from appliance.robots.mavlink import dialect, protocols
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.protocol import Item, Patience, ask, command, command_at, download, upload
+from appliance.robots.mavlink.protocols import Item, RetryPolicy, ask, command, command_at, download, upload
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.verbs import RobotFailure
 
 pytestmark = pytest.mark.anyio
 
-PATIENCE = Patience(timeout_s=0.25, tries=4)
+PATIENCE = RetryPolicy(timeout_s=0.25, tries=4)
 """A loaded machine may stop this process for a tenth of a second: that must not look like silence."""
 BEAT = {"type": 2, "autopilot": 3, "base_mode": 0, "custom_mode": 4, "system_status": 3, "mavlink_version": 3}
 Script = Callable[[Message], list[Message]]
@@ -87,7 +87,7 @@ async def test_in_progress_is_waited_for() -> None:
 async def test_what_is_not_for_us_is_no_answer() -> None:
     """Another command's answer, another component's, and that to a ground station's same command are passed over."""
     fake = Fake(lambda _: [ack(dialect.ACCEPTED, number=22), ack(dialect.DENIED, system=255)])
-    running = asyncio.create_task(ask(fake.vehicle, 400, patience=Patience(timeout_s=5.0, tries=1)))
+    running = asyncio.create_task(ask(fake.vehicle, 400, patience=RetryPolicy(timeout_s=5.0, tries=1)))
     await asyncio.sleep(0.05)
     fake.say(ack(dialect.DENIED), component=100)
     await asyncio.sleep(0.05)
@@ -231,14 +231,14 @@ async def test_parameters_are_read_and_written() -> None:
         return [make("PARAM_VALUE", param_id=name.encode(), **told)]
 
     fake = Fake(script)
-    assert await parameters.read(fake.vehicle, "WPNAV_SPEED", patience=PATIENCE) == 500.0
-    assert await parameters.write(fake.vehicle, "WPNAV_SPEED", 0.1, patience=PATIENCE) == pytest.approx(0.1)
+    assert await protocols.read(fake.vehicle, "WPNAV_SPEED", patience=PATIENCE) == 500.0
+    assert await protocols.write(fake.vehicle, "WPNAV_SPEED", 0.1, patience=PATIENCE) == pytest.approx(0.1)
     with pytest.raises(RobotFailure, match="keeps STUBBORN at 1 instead of 2"):
-        await parameters.write(fake.vehicle, "STUBBORN", 2.0, patience=PATIENCE)
+        await protocols.write(fake.vehicle, "STUBBORN", 2.0, patience=PATIENCE)
     with pytest.raises(RobotFailure, match="keeps the vehicle safe"):
-        await parameters.write(fake.vehicle, "FENCE_ENABLE", 0.0, patience=PATIENCE)
+        await protocols.write(fake.vehicle, "FENCE_ENABLE", 0.0, patience=PATIENCE)
     with pytest.raises(RobotFailure, match="does not tell NOTHING"):
-        await parameters.read(fake.vehicle, "NOTHING", patience=PATIENCE)
+        await protocols.read(fake.vehicle, "NOTHING", patience=PATIENCE)
     for wrong in ("", "no spaces", "WAY_TOO_LONG_A_NAME", "Ä"):
         with pytest.raises(RobotFailure, match="is no name"):
-            parameters.check_name(wrong)
+            protocols.check_name(wrong)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from appliance.model import Site
 from appliance.robots.mavlink.dialect import Codec, Frame, frame_length
-from appliance.robots.mavlink.links.udp import UdpServer
+from appliance.robots.mavlink.links import UdpServer
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import Remote
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from appliance.robots.mavlink.requests import REPEAT_S, task_number
+from appliance.robots.mavlink.command_server import REPEAT_S, task_number
 from tests.unit.robots.conftest import FakeStore
 from tests.unit.robots.test_requests import ACCEPTED, DENIED, IN_PROGRESS, TEMPORARILY_REJECTED, Fleet
 

@@ -12,11 +12,11 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import NotFoundError, PayloadError
-from appliance.robots.mavlink import dialect, parameters
+from appliance.robots.mavlink import dialect, protocols
+from appliance.robots.mavlink.command_server import parameters_of
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.mission_plan import UnfitItem, plan_of
-from appliance.robots.mavlink.protocol import Patience, command
-from appliance.robots.mavlink.requests import parameters_of
+from appliance.robots.mavlink.mission_server import UnfitItem, plan_of
+from appliance.robots.mavlink.protocols import RetryPolicy, command
 from appliance.robots.verbs import RobotFailure, in_range
 from tests.unit.robots.conftest import FakeStore
 from tests.unit.robots.test_mission_desk import (
@@ -306,7 +306,7 @@ async def test_any_number_of_progress_reports_before_the_end() -> None:
 async def test_progress_gives_more_time_and_stops_repetitions() -> None:
     """What reports that it goes on is neither given up nor sent again (mavlink/qgroundcontrol#10852)."""
     fake = Fake(lambda _: [ack(dialect.IN_PROGRESS)])
-    running = asyncio.create_task(command(fake.vehicle, 400, patience=Patience(timeout_s=0.05, tries=2)))
+    running = asyncio.create_task(command(fake.vehicle, 400, patience=RetryPolicy(timeout_s=0.05, tries=2)))
     async with asyncio.timeout(60):
         while not fake.sent:
             await asyncio.sleep(0)
@@ -346,11 +346,11 @@ class Px4:
 
     async def read(self, name: str) -> float:
         """Read one as the gateway does."""
-        return await parameters.read(self.fake.vehicle, name, patience=PATIENCE)
+        return await protocols.read(self.fake.vehicle, name, patience=PATIENCE)
 
     async def write(self, name: str, value: float) -> float:
         """Write one as the gateway does."""
-        return await parameters.write(self.fake.vehicle, name, value, patience=PATIENCE)
+        return await protocols.write(self.fake.vehicle, name, value, patience=PATIENCE)
 
 
 @pytest.mark.parametrize("value", [0, 1, 5, -1, 1_065_353_216, 2**31 - 1, -(2**31)])
@@ -385,7 +385,7 @@ async def test_ardupilots_whole_numbers_are_cast() -> None:
     """
     told = {"param_value": 5.0, "param_type": 6, "param_count": 2, "param_index": 0}
     fake = Fake(lambda _: [make("PARAM_VALUE", param_id=b"SYSTEM", **told)])
-    assert await parameters.read(fake.vehicle, "SYSTEM", patience=PATIENCE) == 5.0
+    assert await protocols.read(fake.vehicle, "SYSTEM", patience=PATIENCE) == 5.0
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])

@@ -8,12 +8,10 @@ from typing import Any
 
 import pytest
 
-from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Stream, make
-from appliance.robots.mavlink.kinds import KINDS, checksum
-from appliance.robots.mavlink.routing import End, Router, Rules
-from appliance.robots.mavlink.said import Texts
+from appliance.robots.mavlink.dialect import KINDS, Codec, Damage, Frame, Stream, checksum, make
+from appliance.robots.mavlink.routing import End, RoutingTable, Rules
 from appliance.robots.mavlink.signing import Signer
-from appliance.robots.mavlink.texts import NOTICE, statustext
+from appliance.robots.mavlink.statustext import NOTICE, Texts, statustext
 from tests.unit.robots.links import BEAT, KEY
 
 V1, V2 = 0xFE, 0xFD
@@ -108,7 +106,7 @@ def test_a_target_that_was_trimmed_off_is_everybody() -> None:
     (frame,) = Codec(242, 191).read(raw)
     assert isinstance(frame, Frame)
     assert (frame.target_system, frame.target_component) == (0, 0)
-    router = Router([Rules()] * 2, own_system=242)
+    router = RoutingTable([Rules()] * 2, own_system=242)
     ends = [End(number, ("", number)) for number in (0, 1)]
     for end, system in zip(ends, (255, 1), strict=True):
         router.hear(frame if system == 255 else _heard(system), end, 0.0)
@@ -208,7 +206,7 @@ def test_a_text_that_is_longer_than_a_message_is_sent_whole() -> None:
 
 def test_a_component_gets_what_is_for_it_alone() -> None:
     """Two components of one system at two ends: a target component is heeded (mavlink-router/mavlink-router#207)."""
-    router = Router([Rules()] * 3, own_system=242)
+    router = RoutingTable([Rules()] * 3, own_system=242)
     pilot, gimbal, ground = (End(number, ("", number)) for number in range(3))
     for end, frame in ((pilot, _heard(1, 1)), (gimbal, _heard(1, 154)), (ground, _heard(255, 190))):
         router.hear(frame, end, 0.0)
@@ -222,7 +220,7 @@ def test_a_component_gets_what_is_for_it_alone() -> None:
 
 def test_a_slow_end_gets_the_messages_that_its_link_lets_out() -> None:
     """Rules keep the flood of a fleet from a gimbal that can read four messages (mavlink-router/mavlink-router#452)."""
-    router = Router([Rules(), Rules(only_out=frozenset({"HEARTBEAT"}))], own_system=242)
+    router = RoutingTable([Rules(), Rules(only_out=frozenset({"HEARTBEAT"}))], own_system=242)
     pilot, gimbal = End(0, ("", 0)), End(1, ("", 1))
     router.hear(_heard(1), pilot, 0.0)
     router.hear(_heard(2, 154), gimbal, 0.0)
@@ -236,6 +234,6 @@ def test_what_is_sent_again_later_is_no_copy() -> None:
 
     Reported as mavlink-router/mavlink-router#323.
     """
-    router = Router(own_system=242, repeat_s=0.5)
+    router = RoutingTable(own_system=242, repeat_s=0.5)
     data = beat()
     assert [router.repeated(data, at, sender=(7, 1)) for at in (0.0, 0.4, 1.0)] == [False, True, False]

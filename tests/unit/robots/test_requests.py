@@ -9,11 +9,11 @@ import pytest
 
 from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import Failure, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState
-from appliance.robots.doors import Tasks
+from appliance.robots.mavlink.command_server import MAX_AT_WORK, CommandServer, task_number
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.requests import MAX_AT_WORK, RequestDesk, task_number
 from appliance.robots.qgc import actions
 from appliance.robots.settings import RobotsConfig, Template
+from appliance.robots.task_listener import Tasks
 from tests.unit.robots.conftest import FakeStore
 
 pytestmark = pytest.mark.anyio
@@ -43,10 +43,10 @@ class Fleet:
         self.refused: dict[str, int] = {}
         self.desk = self.new_desk()
 
-    def new_desk(self) -> RequestDesk:
+    def new_desk(self) -> CommandServer:
         """Return a desk on the same store, as after a restart."""
         tasks = Tasks(submit=self.submit, cancel=self.cancel_by, look=self.look)
-        return RequestDesk(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused, reach=self.reach)
+        return CommandServer(TEMPLATES, tasks=tasks, store=self.store, refused=self.refused, reach=self.reach)
 
     def reach(self, sender: str, system: int) -> Callable[[Message], None] | None:
         """Find a sender of before a restart, once it is heard."""

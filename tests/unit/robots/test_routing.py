@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.robots.mavlink.routing import End, Passage, Router, Rules
+from appliance.robots.mavlink.routing import End, Passage, RoutingTable, Rules
 
 GCS, DRONE, CAMERA = End(0, ("gcs", 1)), End(1, ("drone", 1)), End(2, ("camera", 1))
 OWN = 245
@@ -15,9 +15,9 @@ def passage(system: int, component: int = 1, *, to: int = 0, part: int = 0, name
     return Passage(system=system, component=component, name=name, raw=raw, target_system=to, target_component=part)
 
 
-def router(*rules: Rules) -> Router:
+def router(*rules: Rules) -> RoutingTable:
     """Return a router that has heard a ground station, a drone and its camera on a link of its own."""
-    made = Router(rules or (Rules(), Rules(), Rules()), own_system=OWN)
+    made = RoutingTable(rules or (Rules(), Rules(), Rules()), own_system=OWN)
     for end, (system, component) in ((GCS, (255, 190)), (DRONE, (1, 1)), (CAMERA, (1, 100))):
         made.hear(passage(system, component), end, 0.0)
     return made
@@ -69,7 +69,7 @@ def test_silent_ends_are_forgotten() -> None:
 @given(st.lists(st.tuples(st.binary(min_size=1, max_size=2), st.floats(0, 3)), max_size=40))
 def test_repetitions_within_the_time_and_no_others(frames: list[tuple[bytes, float]]) -> None:
     """The same bytes are dropped exactly when they were last let through less than half a second before."""
-    made = Router((Rules(),), own_system=OWN)
+    made = RoutingTable((Rules(),), own_system=OWN)
     passed: dict[bytes, float] = {}
     for raw, now in sorted(frames, key=lambda each: each[1]):
         expected = raw in passed and now - passed[raw] <= 0.5
@@ -81,7 +81,7 @@ def test_repetitions_within_the_time_and_no_others(frames: list[tuple[bytes, flo
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=30), st.integers(0, 5))
 def test_in_a_ring_of_routers_a_frame_ends(path: list[int], start: int) -> None:
     """Whatever way copies of a frame take between six routers in a ring, each router sends it on at most once."""
-    routers = [Router((Rules(), Rules()), own_system=OWN + index) for index in range(6)]
+    routers = [RoutingTable((Rules(), Rules()), own_system=OWN + index) for index in range(6)]
     for made in routers:
         for side in (0, 1):
             made.hear(passage(100 + side), End(side, ("neighbour", side)), 0.0)
@@ -110,7 +110,7 @@ def test_senders_age_apart_from_their_end() -> None:
 
 def test_a_fast_sender_may_say_the_same_again() -> None:
     """The same bytes after 128 frames of their sender are news, as its numbers wrapped; before they are not."""
-    made = Router((Rules(),), own_system=OWN)
+    made = RoutingTable((Rules(),), own_system=OWN)
     assert not made.repeated(b"beat", 0.0, sender=(1, 1))
     for number in range(127):
         assert not made.repeated(b"%d" % number, 0.001, sender=(1, 1))

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.robots.mavlink.stats import Limiter, LinkStats, Sender
+from appliance.robots.mavlink.links import Limiter, LinkStats, Sender
 
 HERE, THERE = ("a", 1), ("b", 1)
 

@@ -9,8 +9,8 @@ import pytest
 
 from appliance.model import Notice, Site
 from appliance.ports import free_port
-from appliance.robots.mavlink.damping import BURST_S, MAX_KINDS, TRICKLE, WINDOW_S, Damper
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
+from appliance.robots.mavlink.routing import BURST_S, MAX_KINDS, TRICKLE, WINDOW_S, Damper
 from tests.unit.robots.links import BEAT, Wire, sender, station, until
 from workshop.robots.copter import SimCopter
 from workshop.robots.rover import SimRover

@@ -10,9 +10,9 @@ import pytest
 
 from appliance.errors import ConfigError, NotFoundError, RefusedError
 from appliance.robots.mavlink.dialect import Codec, Damage, Frame, make
+from appliance.robots.mavlink.link_manager import KEY, LinkManager, OpenLink, rules_of
 from appliance.robots.mavlink.links import Address
-from appliance.robots.mavlink.routing import Router
-from appliance.robots.mavlink.table import KEY, LinkTable, OpenLink, rules_of
+from appliance.robots.mavlink.routing import RoutingTable
 from appliance.robots.settings import MavlinkLink, RobotsConfig, read_remote
 from tests.unit.robots.conftest import FakeStore
 
@@ -28,8 +28,8 @@ class Bench:
         self.heard: list[tuple[int, str, Address]] = []
         self.gone: list[str] = []
         self.refused: dict[str, int] = {}
-        self.router = Router(own_system=245)
-        self.table = LinkTable(
+        self.router = RoutingTable(own_system=245)
+        self.table = LinkManager(
             config,
             store=store,
             router=self.router,

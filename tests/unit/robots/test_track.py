@@ -3,8 +3,7 @@
 from appliance.model import Pose, Site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Codec, Frame
-from appliance.robots.mavlink.track import Report, Track, apart_s
-from appliance.robots.mavlink.vehicle import Vehicle
+from appliance.robots.mavlink.vehicle import Report, Track, Vehicle, apart_s
 
 
 def _report(boot_ms: int, heard_at: float = 0.0) -> Report:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Box, Pose, Site
-from appliance.robots.policy import check_velocity
+from appliance.robots.limits import check_velocity
 from appliance.robots.verbs import RobotFailure, VelocityArgs
 from workshop.robots.driving import Driving
 

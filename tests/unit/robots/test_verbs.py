@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from appliance.model import Box, Pose, Site
-from appliance.robots.policy import check_way
+from appliance.robots.limits import check_way
 from appliance.robots.verbs import GotoArgs, RobotFailure, Waypoint, cruise, parse_args
 
 SITE = Site(

@@ -16,7 +16,7 @@ from appliance.errors import ConfigError, SwiftbotError
 from appliance.model import Enquiry, SoftStop
 from appliance.pool.api import Evicted, Released, Warmed
 from appliance.pool.transfer.api import Brought
-from appliance.robots.authority.api import StopAnswer
+from appliance.robots.api import StopAnswer
 from appliance.tasks.migration.api import DrainState, Migrated
 from appliance.tasks.why import TaskWhy
 from appliance.tui import grammar, signs

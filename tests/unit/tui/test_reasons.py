@@ -9,7 +9,7 @@ import pytest
 from appliance.cli import app
 from appliance.pool.api import Evicted, Released, Warmed
 from appliance.pool.transfer.api import Brought
-from appliance.robots.authority.api import StopAnswer
+from appliance.robots.api import StopAnswer
 from appliance.tasks.migration.api import DrainState, Migrated
 from appliance.tui import grammar
 from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS

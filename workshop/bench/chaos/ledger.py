@@ -17,8 +17,7 @@ from msgspec import Struct
 from appliance.model import RobotInfo, encode
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.robots.commands import CommandDesk, Done, Verb
-from appliance.robots.ledger import Ledger
+from appliance.robots.executor import CommandExecutor, Done, IdempotencyLog, Verb
 from appliance.robots.verbs import PickArgs
 
 STATE_S = 0.5
@@ -68,10 +67,10 @@ class LedgerRobot:
         self._session = session
         self._file = file
         self.refused: dict[str, int] = {}
-        self.desk = CommandDesk(
+        self.desk = CommandExecutor(
             name,
             session=session,
-            ledger=Ledger(name, limit=REMEMBERED),
+            ledger=IdempotencyLog(name, limit=REMEMBERED),
             verbs={"pick": Verb(run=self._write)},
             ready=lambda: None,
             halt=self._halt,

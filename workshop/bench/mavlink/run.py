@@ -24,8 +24,7 @@ from appliance.errors import PrerequisiteError
 from appliance.plane.keys import Keys
 from appliance.ports import free_port
 from appliance.record.reader import read
-from appliance.robots.mavlink.dialect import Codec, Frame, make
-from appliance.robots.mavlink.frames import check
+from appliance.robots.mavlink.dialect import Codec, Frame, check, make
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 from workshop.bench.figures import ratio
 from workshop.bench.mavlink import others, tlog

@@ -11,8 +11,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from appliance.errors import ConfigError
-from appliance.robots.mavlink.dialect import Codec, make
-from appliance.robots.mavlink.frames import MARKER_V1, MARKER_V2, Frame, check, frame_length
+from appliance.robots.mavlink.dialect import MARKER_V1, MARKER_V2, Codec, Frame, check, frame_length, make
 
 GROUND_SYSTEMS = range(200, 256)
 """System ids of ground stations: they count from 255 downward."""

@@ -7,8 +7,8 @@ import pytest
 
 from appliance.model import Lease, RobotCommand, SoftStop
 from appliance.robots.authority.authority import Authority
-from appliance.robots.authority.leases import Leases
-from appliance.robots.authority.stops import Stops
+from appliance.robots.authority.lease import Leases
+from appliance.robots.authority.soft_stop import Stops
 
 
 class Known:

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.model import Lease
-from appliance.robots.authority.leases import EXPIRED, MOST, Leases
+from appliance.robots.authority.lease import EXPIRED, MOST, Leases
 
 
 def lease(name: str, robot: str = "r1", **fields: object) -> Lease:

@@ -11,9 +11,9 @@ import pytest
 from appliance.errors import ConflictError, RefusedError, UnreachableError
 from appliance.model import Lease, RobotCommand, encode
 from appliance.plane.dht import Record
-from appliance.robots.authority import leasing as module
-from appliance.robots.authority.api import DriveAsk, RenewAsk, TakeAsk
-from appliance.robots.authority.leasing import Leasing
+from appliance.robots.api import DriveAsk, RenewAsk, TakeAsk
+from appliance.robots.authority import lease as module
+from appliance.robots.authority.lease import Leasing
 from tests.unit.robots.authority.conftest import FakePlane
 
 pytestmark = pytest.mark.anyio

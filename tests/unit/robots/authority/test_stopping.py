@@ -7,10 +7,9 @@ from typing import Any, cast
 import pytest
 
 from appliance.model import SoftStop, encode
-from appliance.robots.authority import stopping
-from appliance.robots.authority.api import ResumeRobotsAsk, StandingAsk, StopAsk
-from appliance.robots.authority.stopping import STORED, Stopping
-from appliance.robots.authority.stops import MOST, RESERVE
+from appliance.robots.api import ResumeRobotsAsk, StandingAsk, StopAsk
+from appliance.robots.authority import soft_stop
+from appliance.robots.authority.soft_stop import MOST, RESERVE, STORED, Stopping
 from tests.unit.robots.authority.conftest import FakePlane
 
 pytestmark = pytest.mark.anyio
@@ -19,8 +18,8 @@ pytestmark = pytest.mark.anyio
 @pytest.fixture
 async def known(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Stopping]:
     """Return soft stops that were started with what the plane keeps; its rounds are short."""
-    monkeypatch.setattr(stopping, "AGAIN_S", (0.0,))
-    monkeypatch.setattr(stopping, "EVERY_S", 0.01)
+    monkeypatch.setattr(soft_stop, "AGAIN_S", (0.0,))
+    monkeypatch.setattr(soft_stop, "EVERY_S", 0.01)
     it = Stopping(cast("Any", plane), changed=lambda: None)
     yield it
     await it.close()
@@ -36,7 +35,7 @@ async def until(holds: Callable[[], bool]) -> None:
 async def rounds(count: int = 5) -> None:
     """Let some rounds pass."""
     for _ in range(count):  # each in a turn of its own, however late it comes
-        await asyncio.sleep(stopping.EVERY_S)
+        await asyncio.sleep(soft_stop.EVERY_S)
 
 
 async def nothing() -> None:

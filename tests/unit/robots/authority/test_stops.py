@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Lifted, SoftStop
-from appliance.robots.authority.stops import MOST, RESERVE, Stops
+from appliance.robots.authority.soft_stop import MOST, RESERVE, Stops
 
 ROBOTS = ("r1", "r2", "r3")
 some = st.sets(st.sampled_from(ROBOTS), max_size=2).map(lambda found: tuple(sorted(found)))

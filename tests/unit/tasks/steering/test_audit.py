@@ -7,7 +7,7 @@ import pytest
 from appliance.errors import ConflictError, PayloadError
 from appliance.model import Act, TaskRecord, TaskRequest, encode
 from appliance.pool.transfer.api import FetchAsk
-from appliance.robots.authority.api import StopAsk
+from appliance.robots.api import StopAsk
 from appliance.tasks.steering.api import ActsAsk, PauseAsk, RetryAsk
 from appliance.tasks.steering.audit import KEPT, Audit, target_of
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from appliance.errors import ConfigError
 from appliance.model import Place, Site
 from appliance.robots.mavlink import dialect
-from appliance.robots.mavlink.condition import estimator
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
-from appliance.robots.mavlink.modes import ROVER
+from appliance.robots.mavlink.vehicle import ROVER, estimator
 from workshop.robots.autopilot import AnyAutopilot
 from workshop.robots.components import PITCH_DEG, Component, SimCamera, SimGimbal
 from workshop.robots.copter import SimCopter

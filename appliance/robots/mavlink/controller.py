@@ -1,8 +1,12 @@
-"""What all verbs of a MAVLink vehicle are made of: change its mode, arm it, watch it on its way.
+"""What all verbs of a MAVLink vehicle are made of: change its mode, arm it, watch it on its way, move it by hand.
 
 A verb ends when the vehicle says that it is where it should be, never when a command was acknowledged. Modes are
 changed by DO_SET_MODE and verified by the heartbeat, since an acknowledgement can be lost or late. Nothing here
-commands a vehicle that a pilot or a failsafe has (`control`).
+commands a vehicle that a pilot or a failsafe has (`vehicle.Control`).
+
+Manual control moves it for a moment at a time, by velocities in its guided mode; then it holds by itself:
+SET_POSITION_TARGET_LOCAL_NED with velocities in the body's frame (ArduPilot, "Copter Commands in Guided Mode" and
+"Rover Commands in Guided Mode"). The autopilot stops by itself when none came for `GUID_TIMEOUT`, 3 s; the end is sent.
 """
 
 import asyncio
@@ -14,14 +18,12 @@ import structlog
 
 from appliance.model import Pose, Site
 from appliance.model.geo import to_globe, to_site
-from appliance.robots.commands import Done, Verb
+from appliance.robots.executor import Done, Verb
+from appliance.robots.limits import breach, check_velocity
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Message, make
-from appliance.robots.mavlink.modes import Modes
-from appliance.robots.mavlink.protocol import Patience, ask, command
-from appliance.robots.mavlink.track import Report, apart_s
-from appliance.robots.mavlink.vehicle import Vehicle
-from appliance.robots.policy import breach
+from appliance.robots.mavlink.protocols import RetryPolicy, ask, command
+from appliance.robots.mavlink.vehicle import Modes, Report, Vehicle, apart_s
 from appliance.robots.settings import RobotsConfig
 from appliance.robots.verbs import RobotFailure, VelocityArgs
 
@@ -47,14 +49,14 @@ TAKEN = "taken"
 Point = tuple[float, float, float]
 
 
-class Craft:
+class VehicleController:
     """One vehicle as its verbs see it."""
 
     def __init__(self, vehicle: Vehicle, *, site: Site, config: RobotsConfig) -> None:
         self.vehicle = vehicle
         self.site = site
         self.config = config
-        self.patience = Patience(timeout_s=config.ack_timeout_s, tries=config.tries)
+        self.patience = RetryPolicy(timeout_s=config.ack_timeout_s, tries=config.tries)
 
     @property
     def modes(self) -> Modes:
@@ -407,3 +409,34 @@ class Craft:
             "battery_percent": self.vehicle.battery_percent,
             "mode": self.vehicle.mode,
         }
+
+
+_EVERY_S = 0.1
+
+
+class ManualControl:
+    """Of one vehicle."""
+
+    def __init__(self, craft: VehicleController) -> None:
+        self._craft = craft
+
+    async def velocity(self, args: VelocityArgs) -> Done:
+        """Move for `for_s` seconds; RobotFailure where it may not, or is on the ground and flies."""
+        craft, vehicle = self._craft, self._craft.vehicle
+        check_velocity(craft.site, await craft.fix(), args, flies=vehicle.flies)
+        if not vehicle.armed or (vehicle.flies and not vehicle.airborne):
+            what = "is on the ground" if vehicle.flies else "is not armed"
+            first = "takeoff" if vehicle.flies else "arm"
+            raise RobotFailure("precondition", f"{vehicle.name} {what}", remedy=f"`{first}` first")
+        if vehicle.mode != craft.modes.guided:
+            await craft.mode(craft.modes.guided)
+        loop = asyncio.get_running_loop()
+        until = loop.time() + args.for_s
+        try:
+            while loop.time() < until:
+                craft.check_control()
+                craft.push(args)
+                await asyncio.sleep(min(_EVERY_S, max(0.0, until - loop.time())))
+        finally:
+            craft.push(VelocityArgs())
+        return Done({"moved_s": args.for_s} | craft.where())

@@ -30,12 +30,11 @@ from msgspec import Meta, Struct, field
 
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest, encode
-from appliance.robots.doors import Tasks
-from appliance.robots.intake import own
 from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink.command_server import STATION
 from appliance.robots.mavlink.dialect import Frame, Message
-from appliance.robots.mavlink.requests import STATION
 from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE, SILENT, Channel, NotDelivered
+from appliance.robots.task_listener import Tasks, own
 
 log = structlog.get_logger(__name__)
 
@@ -54,7 +53,7 @@ MOST_NEWS = 256
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
 
 
-class Letter(Struct, frozen=True, kw_only=True):
+class TunnelMessage(Struct, frozen=True, kw_only=True):
     """What a sender wants. Fields of later versions are ignored."""
 
     op: Literal["submit", "follow", "cancel"]
@@ -119,7 +118,7 @@ class _Sender:
         return failed
 
 
-class LetterDesk:
+class TunnelServer:
     """Takes messages and answers them.
 
     Args:
@@ -207,7 +206,7 @@ class LetterDesk:
 
     def _read(self, sender: _Sender, data: bytes) -> None:
         try:
-            letter = msgspec.json.decode(data, type=Letter)
+            letter = msgspec.json.decode(data, type=TunnelMessage)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self._count("tunnel_malformed")
             self._say(
@@ -221,7 +220,7 @@ class LetterDesk:
         self._at_work.add(work)
         work.add_done_callback(self._at_work.discard)
 
-    async def _carry_out(self, sender: _Sender, letter: Letter) -> None:
+    async def _carry_out(self, sender: _Sender, letter: TunnelMessage) -> None:
         new = self._follow(letter.id, sender)
         try:
             if self._tasks is None:
@@ -259,7 +258,7 @@ class LetterDesk:
         if not found:
             self._followed.pop(task, None)
 
-    def _reject(self, sender: _Sender, letter: Letter, error: SwiftbotError) -> None:
+    def _reject(self, sender: _Sender, letter: TunnelMessage, error: SwiftbotError) -> None:
         passing = isinstance(error, _PASSING)
         self._count("mavlink_request_rejected" if passing else "mavlink_request_denied")
         log.warning(

@@ -70,7 +70,7 @@ class End(Struct, frozen=True):
 Step = Ask | Wait | Done | End
 
 
-class Patience:
+class CommandRetry:
     """Decides for one command; `next` says what to do, the other methods tell it what happened. Times in seconds.
 
     Args:

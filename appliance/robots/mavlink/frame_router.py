@@ -12,20 +12,18 @@ import structlog
 from appliance.model import Notice, Site, TaskRecord, encode
 from appliance.plane.session import Closer, Session
 from appliance.robots.api import LinkList
-from appliance.robots.doors import Tasks
-from appliance.robots.ledger import KeyValues
-from appliance.robots.mavlink.damping import Kind
-from appliance.robots.mavlink.dialect import Frame, Message, make
-from appliance.robots.mavlink.frames import MARKER_V2
-from appliance.robots.mavlink.letters import LetterDesk
+from appliance.robots.executor import KeyValues
+from appliance.robots.mavlink.command_server import COMMAND_MESSAGES, CommandServer
+from appliance.robots.mavlink.dialect import MARKER_V2, Frame, Message, make
+from appliance.robots.mavlink.link_manager import LinkManager, OpenLink
 from appliance.robots.mavlink.links import Address
-from appliance.robots.mavlink.mission_desk import MISSION_MESSAGES, MissionDesk
-from appliance.robots.mavlink.requests import COMMAND_MESSAGES, RequestDesk
-from appliance.robots.mavlink.routing import End, Router
-from appliance.robots.mavlink.table import LinkTable, OpenLink
+from appliance.robots.mavlink.mission_server import MISSION_MESSAGES, MissionServer
+from appliance.robots.mavlink.routing import End, Kind, RoutingTable
 from appliance.robots.mavlink.tunnel import PAYLOAD_TYPE
+from appliance.robots.mavlink.tunnel_rpc import TunnelServer
 from appliance.robots.mavlink.vehicle import Vehicle
 from appliance.robots.settings import RobotsConfig
+from appliance.robots.task_listener import Tasks
 
 log = structlog.get_logger(__name__)
 
@@ -42,7 +40,7 @@ SETUP_SIGNING = (256).to_bytes(3, "little")
 """The id of that message, as it stands in a frame."""
 
 
-class Switch:
+class FrameRouter:
     """All links of one gateway, and the ways between them.
 
     Args:
@@ -85,8 +83,8 @@ class Switch:
         self._names_at = names_at
         self._name_of = name_of
         self._loop = asyncio.get_running_loop()
-        self.router = Router(own_system=config.system_id, repeat_s=config.repeat_s)
-        self.links = LinkTable(
+        self.router = RoutingTable(own_system=config.system_id, repeat_s=config.repeat_s)
+        self.links = LinkManager(
             config,
             store=store,
             router=self.router,
@@ -95,7 +93,7 @@ class Switch:
             refused=refused,
             busy=lambda: session.unsent > _BUSY,
         )
-        self._missions = MissionDesk(
+        self._missions = MissionServer(
             config,
             site=site,
             store=store,
@@ -103,7 +101,7 @@ class Switch:
             clock=time.monotonic,
             problems=(lambda _: ()) if tasks is None else tasks.problems,
         )
-        self._requests = RequestDesk(
+        self._requests = CommandServer(
             config.templates,
             tasks=tasks,
             store=store,
@@ -111,7 +109,7 @@ class Switch:
             mission=self._missions.request,
             reach=self._reach,
         )
-        self._letters = LetterDesk(tasks=tasks, refused=refused, clock=time.monotonic)
+        self._letters = TunnelServer(tasks=tasks, refused=refused, clock=time.monotonic)
         self._records: Closer | None = None
         self._tell_at = 0.0
 

@@ -1,9 +1,12 @@
 """A gateway's MAVLink vehicles on the plane: roster entries, commands, raw frames.
 
 A vehicle becomes a robot of the fleet by its autopilot's heartbeat, under the name its link gives it. From then
-on the station speaks for it: it puts RobotInfo, holds its liveliness token while heartbeats come, answers
+on the manager speaks for it: it puts RobotInfo, holds its liveliness token while heartbeats come, answers
 commands, and puts every frame of it on the plane for the recorder. It takes no name that another robot has.
 Ground stations on any link are its guests: frames pass between them and the vehicles (`routing`).
+
+Of its own accord a gateway says to vehicles that it is there (its heartbeat), and at which rates it wants to be told
+what.
 """
 
 import asyncio
@@ -17,19 +20,59 @@ from appliance.errors import SwiftbotError
 from appliance.model import Failure, RobotCommand, Site, encode
 from appliance.plane.session import Closer, Session
 from appliance.robots.api import LinkList
-from appliance.robots.commands import CommandDesk
-from appliance.robots.doors import Tasks
-from appliance.robots.ledger import KeyValues, Ledger
-from appliance.robots.mavlink.control import OVERRIDES, moved
-from appliance.robots.mavlink.dialect import Frame, Message
-from appliance.robots.mavlink.greeting import ask_streams, heartbeat
-from appliance.robots.mavlink.helm import Helm
-from appliance.robots.mavlink.keeping import REMEMBER_S
+from appliance.robots.executor import CommandExecutor, IdempotencyLog, KeyValues
+from appliance.robots.mavlink import dialect
+from appliance.robots.mavlink.command_dispatcher import CommandDispatcher
+from appliance.robots.mavlink.dialect import Frame, Message, make
+from appliance.robots.mavlink.frame_router import FrameRouter
+from appliance.robots.mavlink.link_manager import REMEMBER_S, LinkManager, OpenLink
 from appliance.robots.mavlink.routing import End
-from appliance.robots.mavlink.switch import Switch
-from appliance.robots.mavlink.table import LinkTable, OpenLink
-from appliance.robots.mavlink.vehicle import Vehicle, is_autopilot
+from appliance.robots.mavlink.vehicle import OVERRIDES, Vehicle, is_autopilot, moved
 from appliance.robots.settings import RobotsConfig
+from appliance.robots.task_listener import Tasks
+
+STREAMS_HZ = {
+    "GLOBAL_POSITION_INT": 5.0,
+    "SYS_STATUS": 1.0,
+    "MISSION_CURRENT": 2.0,
+    "HOME_POSITION": 0.2,
+    "BATTERY_STATUS": 0.5,
+    "EKF_STATUS_REPORT": 1.0,
+    "FENCE_STATUS": 1.0,
+}
+"""What is asked of a vehicle that has come online; ArduPilot sends little of it by itself."""
+
+
+def heartbeat() -> Message:
+    """Return the heartbeat of an onboard computer."""
+    return make(
+        "HEARTBEAT",
+        type=dialect.TYPE_ONBOARD,
+        autopilot=dialect.AUTOPILOT_NONE,
+        base_mode=0,
+        custom_mode=0,
+        system_status=dialect.STATE_ACTIVE,
+        mavlink_version=3,
+    )
+
+
+def ask_streams(vehicle: Vehicle) -> None:
+    """Ask a vehicle for messages at their rates (MAV_CMD_SET_MESSAGE_INTERVAL); asked again when it is back online."""
+    for stream, hz in STREAMS_HZ.items():
+        fields = {f"param{number}": 0.0 for number in range(3, 8)}
+        vehicle.send(
+            make(
+                "COMMAND_LONG",
+                target_system=vehicle.system,
+                target_component=vehicle.component,
+                command=dialect.SET_INTERVAL,
+                confirmation=0,
+                param1=float(dialect.constant(f"MAVLINK_MSG_ID_{stream}")),
+                param2=1e6 / hz,
+                **fields,
+            )
+        )
+
 
 log = structlog.get_logger(__name__)
 
@@ -41,7 +84,7 @@ _OFFLINE_INFO_S = 5.0
 class _Attached:
     """A vehicle and all that serves it."""
 
-    def __init__(self, vehicle: Vehicle, helm: Helm, desk: CommandDesk, end: End) -> None:
+    def __init__(self, vehicle: Vehicle, helm: CommandDispatcher, desk: CommandExecutor, end: End) -> None:
         self.vehicle = vehicle
         self.helm = helm
         self.desk = desk
@@ -52,7 +95,7 @@ class _Attached:
         self.queryable: Closer | None = None
 
 
-class Station:
+class VehicleManager:
     """All MAVLink vehicles of one gateway. `attached` names those heard so far; made on the event loop."""
 
     def __init__(
@@ -84,7 +127,7 @@ class Station:
         """Link, system and component of autopilots that may not be robots here."""
         self._names: dict[End, tuple[str, ...]] = {}
         """Vehicles at ends, worked out when first asked for."""
-        self._switch = Switch(
+        self._switch = FrameRouter(
             config,
             session=session,
             store=store,
@@ -109,7 +152,7 @@ class Station:
         return tuple(sorted(self._vehicles))
 
     @property
-    def links(self) -> LinkTable:
+    def links(self) -> LinkManager:
         """The links, which may come and go at run time."""
         return self._switch.links
 
@@ -298,9 +341,9 @@ class Station:
             implausible=lambda _: self._count("implausible"),
         )
         vehicle.announce = lambda message: self._announce(name, message)
-        helm = Helm(vehicle, site=self._site, config=self._config)
-        ledger = Ledger(name, self._store, limit=self._config.ledger)
-        desk = CommandDesk(
+        helm = CommandDispatcher(vehicle, site=self._site, config=self._config)
+        ledger = IdempotencyLog(name, self._store, limit=self._config.ledger)
+        desk = CommandExecutor(
             name,
             session=self._session,
             ledger=ledger,

@@ -1,8 +1,12 @@
-"""Commands to robots: the caller's side. Asks until there is an answer, or until `patience` gives the robot up."""
+"""Commands to robots: the caller's side. Asks until there is an answer, or until `retry` gives the robot up.
+
+`send_command` sends one command and waits for its end, `hold_robot` stops what a task has begun. `tell_to_hold`
+broadcasts the verb `stop`, which every robot answers: whoever carries out its commands ends them and halts.
+"""
 
 import asyncio
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import msgspec
 import structlog
@@ -10,8 +14,8 @@ import structlog
 from appliance.errors import ContractError, DeadlineError, RobotError, SwiftbotError, UnreachableError
 from appliance.model import Failure, RobotCommand, RobotReply, encode
 from appliance.plane.session import Session
-from appliance.robots.commands import MAX_ID, UNREADABLE
-from appliance.robots.patience import Ask, Done, End, Ending, Patience, Wait
+from appliance.robots.executor import MAX_ID, UNREADABLE
+from appliance.robots.retry import Ask, CommandRetry, Done, End, Ending, Wait
 
 log = structlog.get_logger(__name__)
 
@@ -87,7 +91,7 @@ async def _ask_until(
     loop = asyncio.get_running_loop()
     key, payload = session.keys.command(robot), encode(command)
     live = command.verb in ("state", "stop")
-    patience = Patience(loop.time(), timeout_s, live=live, chance=random.random())  # noqa: S311 - no secret
+    patience = CommandRetry(loop.time(), timeout_s, live=live, chance=random.random())  # noqa: S311 - no secret
     # A question stays open when the next one is sent: an answer to any of them will do.
     open_: dict[asyncio.Task[bytes], int] = {}
     reply: RobotReply | None = None
@@ -149,7 +153,7 @@ def _read_reply(robot: str, command: RobotCommand, answer: bytes) -> RobotReply:
 
 
 async def _given_up(
-    session: Session, robot: str, command: RobotCommand, patience: Patience, why: Ending, timeout_s: float
+    session: Session, robot: str, command: RobotCommand, patience: CommandRetry, why: Ending, timeout_s: float
 ) -> SwiftbotError:
     """Return the error of a command that is not asked for any more."""
     silent_s = patience.silence(asyncio.get_running_loop().time())
@@ -203,3 +207,39 @@ async def _send_stop(session: Session, robot: str, command: RobotCommand) -> Non
         await session.query(session.keys.command(robot), encode(stop), timeout_s=_STOP_TIMEOUT_S)
     except SwiftbotError as error:
         log.warning("stop not delivered", robot=robot, id=command.id, error=str(error))
+
+
+TELL_S = 2.0
+"""How long a robot may take to say that it holds."""
+AT_ONCE = 32
+
+
+async def tell_to_hold(
+    session: Session, robots: Iterable[str], *, act: str, timeout_s: float = TELL_S
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Have robots end what they do and hold; those that said so, and why the others did not.
+
+    Args:
+        session: where they are reached.
+        robots: by name.
+        act: id of the order: told twice by it, a robot does it once.
+        timeout_s: how long each may take.
+    """
+    names = sorted(set(robots))
+    room = asyncio.Semaphore(AT_ONCE)
+
+    async def tell(robot: str) -> str:
+        command = RobotCommand(id=f"{act}~{robot}"[:200], verb="stop")
+        async with room:
+            try:
+                answer = await session.query(session.keys.command(robot), encode(command), timeout_s=timeout_s)
+                reply = msgspec.json.decode(answer, type=RobotReply)
+            except SwiftbotError as error:
+                return error.message
+            except UNREADABLE as error:
+                return f"it answered with something else: {error}"
+        return reply.failure.message if reply.failure is not None else ""
+
+    said = await asyncio.gather(*(tell(each) for each in names))
+    held = tuple(robot for robot, problem in zip(names, said, strict=True) if not problem)
+    return held, {robot: problem for robot, problem in zip(names, said, strict=True) if problem}

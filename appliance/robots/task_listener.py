@@ -1,10 +1,11 @@
 """Tasks that robots ask for on `robot/{id}/task`: what they put, or query, goes to the composition root.
 
-This room knows nothing of tasks, so it only checks, bounds and hands over. A put is heard by every gateway of the
-fleet and answered by none; a request without an id gets one made of the robot, the text and the publisher's second,
-so that several gateways that submit it submit one task. A query goes to one gateway, and its answer is the task's
-record once that is durable, or the reason why not. The task is of the robot on whose key it came, whomever it names:
-what robots may have done (`safety.robot_tasks`), whose turn it is and who is told to have asked hang on that.
+This room knows nothing of tasks, so it only checks, bounds and hands over; what it may ask of the rest of the appliance
+is `Tasks`, which the composition root puts in. A put is heard by every gateway of the fleet and answered by none; a
+request without an id gets one made of the robot, the text and the publisher's second, so that several gateways that
+submit it submit one task. A query goes to one gateway, and its answer is the task's record once that is durable, or the
+reason why not. The task is of the robot on whose key it came, whomever it names: what robots may have done
+(`safety.robot_tasks`), whose turn it is and who is told to have asked hang on that.
 """
 
 import hashlib
@@ -13,11 +14,29 @@ from collections.abc import Awaitable, Callable
 
 import msgspec
 import structlog
+from msgspec import Struct
 
 from appliance.errors import PayloadError
-from appliance.model import TaskRecord, TaskRequest, encode
+from appliance.model import Plan, TaskRecord, TaskRequest, encode
 from appliance.plane.keys import check_name
 from appliance.plane.session import Closer, Message, Session
+
+
+class Tasks(Struct, frozen=True):
+    """The doors to the fleet's tasks: `submit` returns when the task is durable, `cancel` when it is being stopped.
+
+    `cancel` is told by whom: a vehicle's name, or `mavlink-{system}-{component}` of whoever else spoke. `look`
+    returns how a task stands; `submit_of` submits what a robot asked on its own key. All raise SwiftbotErrors.
+    """
+
+    submit: Callable[[TaskRequest], Awaitable[TaskRecord]]
+    cancel: Callable[[str, str], Awaitable[TaskRecord]]
+    look: Callable[[str], Awaitable[TaskRecord]]
+    submit_of: Callable[[str, TaskRequest], Awaitable[TaskRecord]] | None = None
+    """None: queries of robots are not answered here."""
+    problems: Callable[[Plan], tuple[str, ...]] = lambda _: ()
+    """What is wrong with a plan, each as a sentence: what has problems here would not run if it was submitted."""
+
 
 log = structlog.get_logger(__name__)
 
@@ -26,7 +45,7 @@ MAX_INSTRUCTION = 4000
 _SECOND_NS = 1_000_000_000
 
 
-class TaskIntake:
+class TaskListener:
     """Listens on the robots' task key.
 
     Args:

@@ -2,13 +2,14 @@
 
 What an operator adds or removes is written to the gateway's store before it is answered, so that a restart finds the
 same links: those of the configuration without the removed ones, and those added. Each link has a number, by which
-routing and signatures know it.
+routing and signatures know it. What signed links know is kept in the store too: after a restart nothing old is believed
+and no time used twice.
 """
 
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
 import structlog
@@ -17,17 +18,50 @@ from msgspec import Struct
 from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import encode
 from appliance.robots.api import LatencyFacts, LinkFacts, SenderFacts
+from appliance.robots.executor import KeyValues
 from appliance.robots.hub import ADDED_LINKS as KEY
-from appliance.robots.ledger import KeyValues
-from appliance.robots.mavlink.damping import Damper
-from appliance.robots.mavlink.dialect import Codec, Frame, make
-from appliance.robots.mavlink.keeping import load_signer, remember
-from appliance.robots.mavlink.kinds import KINDS, NAMES
+from appliance.robots.mavlink.dialect import KINDS, NAMES, Codec, Frame, make
 from appliance.robots.mavlink.links import Address, Link, open_link
-from appliance.robots.mavlink.routing import End, Router, Rules
+from appliance.robots.mavlink.routing import Damper, End, RoutingTable, Rules
+from appliance.robots.mavlink.signing import Memory, Signer, read_key
 from appliance.robots.settings import MavlinkLink, RobotsConfig
 
 log = structlog.get_logger(__name__)
+
+REMEMBER_S = 5.0
+"""How often it is kept; `signing.AHEAD` and `signing.SINCE` are longer."""
+
+
+def _key(link: MavlinkLink) -> str:
+    return f"mavlink/signing/{link.remote}"
+
+
+async def load_signer(link: MavlinkLink, number: int, store: KeyValues) -> Signer | None:
+    """Return the key of a link with what it knew before; None for a link that does not sign. ConfigError: no key.
+
+    From then on the time kept is ahead of what is used, so that a crash at any moment makes none be used twice.
+    """
+    if not link.signing:
+        return None
+    key = await asyncio.to_thread(read_key, link.signing)
+    kept = dict(await store.scan(_key(link))).get(_key(link))
+    try:
+        memory = msgspec.json.decode(kept, type=Memory) if kept else Memory()
+    except msgspec.DecodeError as error:
+        log.warning("what a signed link knew is lost", link=str(link.remote), reason=str(error))
+        memory = Memory()
+    signer = Signer(key, link_id=number % 256, memory=memory)
+    await store.put(_key(link), encode(signer.ahead))
+    return signer
+
+
+async def remember(links: Iterable[tuple[MavlinkLink, Link]], store: KeyValues, *, last: bool = False) -> None:
+    """Keep what the signed links know; `last`: nothing more is sent or heard, so it is exact."""
+    for setting, link in links:
+        signer = link.codec.signer
+        if signer is not None:
+            await store.put(_key(setting), encode(signer.memory if last else signer.ahead))
+
 
 MAX_LINKS = 64
 MOST_TOLD = 64
@@ -96,7 +130,7 @@ def rules_of(setting: MavlinkLink) -> Rules:
     )
 
 
-class LinkTable:
+class LinkManager:
     """All links.
 
     Args:
@@ -114,7 +148,7 @@ class LinkTable:
         config: RobotsConfig,
         *,
         store: KeyValues,
-        router: Router,
+        router: RoutingTable,
         on_frame: Callable[[OpenLink, Frame, Address], None],
         on_gone: Callable[[OpenLink], None],
         refused: dict[str, int],

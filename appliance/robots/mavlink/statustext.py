@@ -1,18 +1,52 @@
-"""What a vehicle says in words: STATUSTEXT, put together from its parts, and which of it explains a refusal.
+"""STATUSTEXT, both ways: what people at ground stations read, and what a vehicle says in words.
 
-A text of more than 50 characters comes in parts with a common `id` (MAVLink guide, STATUSTEXT); parts can be lost, so
-what has arrived is told after a while with a mark where something is missing. Pure, the clock passed in.
+A text of more than 50 characters goes and comes in parts with a common `id` (MAVLink guide, STATUSTEXT); parts can be
+lost, so what has arrived is told after a while with a mark where something is missing. What a vehicle said may explain
+why it refused (`Texts`: pure, the clock passed in).
 """
 
+import secrets
 from collections import OrderedDict, deque
 
 from msgspec import Struct
 
+from appliance.robots.mavlink.dialect import Message, make
+
+INFO, NOTICE, WARNING, ERROR = 6, 5, 4, 3
+"""MAV_SEVERITY."""
 PART = 50
+"""Characters of one STATUSTEXT."""
+MOST = 4 * PART
+"""Characters of a text that is sent: longer ones are cut, and end with `...`."""
+
+
+def statustext(text: str, severity: int) -> list[Message]:
+    """Return a text as at most five parts; ASCII, since displays on radios know no other."""
+    data = text.encode("ascii", "replace")
+    if len(data) > MOST:
+        data = data[: MOST - 4].rstrip() + b"..."  # the last part is then not full
+    return parts(data, severity)
+
+
+def parts(data: bytes, severity: int) -> list[Message]:
+    """Return a text as it is in parts with a common id, none where one is enough.
+
+    A part that is not full ends a text, so one whose last part is full has an empty one behind it (MAVLink,
+    STATUSTEXT).
+    """
+    if len(data) <= PART:
+        return [make("STATUSTEXT", severity=severity, text=data, id=0, chunk_seq=0)]
+    number = 1 + secrets.randbelow(65_535)
+    return [
+        make("STATUSTEXT", severity=severity, text=data[at : at + PART], id=number, chunk_seq=at // PART)
+        for at in range(0, len(data) + 1, PART)
+    ]
+
+
 MAX_PARTS = 8
 MAX_OPEN = 8
 KEPT = 32
-WARNING = 4
+REFUSAL_SEVERITY = 4
 """MAV_SEVERITY_WARNING: what is less urgent explains no refusal, unless it says so itself."""
 _PATIENCE_S = 1.0
 _EXPLAINS = ("prearm:", "arm:", "arming:")
@@ -28,7 +62,7 @@ class Said(Struct, frozen=True):
     @property
     def explains(self) -> bool:
         """Whether it may tell why something was refused."""
-        return self.severity <= WARNING or self.text.lower().startswith(_EXPLAINS)
+        return self.severity <= REFUSAL_SEVERITY or self.text.lower().startswith(_EXPLAINS)
 
 
 class Texts:
