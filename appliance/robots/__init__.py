@@ -1,1 +1,1 @@
-"""MAVLink endpoint and Zenoh robots: commands out, telemetry and tasks in, and simulated ones."""
+"""Robots: MAVLink endpoint and Zenoh robots, commands out, telemetry and tasks in, and who may command them."""

@@ -42,7 +42,7 @@ MAX_BLOB_BYTES = 64 * 2**20
 
 
 class KeyValues(Protocol):
-    """What the ledger needs of the plane's Store."""
+    """What the log needs of the plane's Store."""
 
     async def put(self, key: str, value: bytes) -> None:
         """Write durably."""
@@ -79,7 +79,7 @@ class Verdict(Enum):
 
 
 class IdempotencyLog:
-    """Ledger of one robot: in memory, and in `store` where there is one."""
+    """Idempotency log of one robot: in memory, and in `store` where there is one."""
 
     def __init__(self, robot: str, store: KeyValues | None = None, *, limit: int = 1000) -> None:
         self._store = store
@@ -196,7 +196,7 @@ class Done(Struct, frozen=True):
 class Verb(Struct, frozen=True, kw_only=True):
     """How a robot does one verb. `run` gets the checked arguments and raises RobotFailure when it cannot.
 
-    Cancelling `run` must leave the actuators it uses at rest or let the desk's `halt` do so.
+    Cancelling `run` must leave the actuators it uses at rest or let the executor's `halt` do so.
     """
 
     run: Callable[[Any], Awaitable[Done]]
@@ -273,7 +273,7 @@ class CommandExecutor:
         return encode(await self.execute(command))
 
     async def execute(self, command: RobotCommand) -> RobotReply:
-        """Do the command, join it, or answer from the ledger; DeadlineError when it takes longer than a long poll."""
+        """Do the command, join it, or answer from the log; DeadlineError when it takes longer than a long poll."""
         try:
             return await self._decide(command)
         except RobotFailure as error:
@@ -412,7 +412,7 @@ class CommandExecutor:
         await self._end(list(self._running.values()), failure)
 
     async def close(self) -> None:
-        """End every command without an outcome; callers are told to ask again, and the ledger keeps them open."""
+        """End every command without an outcome; callers are told to ask again, and the log keeps them open."""
         self._closing = True
         await self._end(list(self._running.values()), None)
 

@@ -1,6 +1,6 @@
 """Robots as one gateway has them: its MAVLink vehicles, and the tasks that robots of the fleet ask for.
 
-Zenoh robots speak for themselves and need nothing of a gateway; MAVLink vehicles are spoken for by the station.
+Zenoh robots speak for themselves and need nothing of a gateway; MAVLink vehicles are spoken for by the vehicle manager.
 """
 
 import asyncio
@@ -57,30 +57,30 @@ class RobotHub:
         self.refused: dict[str, int] = {}
         submit = None if tasks is None else tasks.submit_of
         self._intake = None if on_task is None else TaskListener(session, on_task, self.refused, submit=submit)
-        self._station: VehicleManager | None = None
+        self._vehicles: VehicleManager | None = None
         self._opening = asyncio.Lock()
 
     @property
     def attached(self) -> tuple[str, ...]:
         """Names of the MAVLink vehicles heard since start, online or not."""
-        return () if self._station is None else self._station.attached
+        return () if self._vehicles is None else self._vehicles.attached
 
     async def start(self) -> None:
         """Bind the ports and begin; ConfigError with the remedy when a setting is wrong or a port taken."""
         self._config.check()
         if self._config.mavlink or await self._store.scan(ADDED_LINKS):
-            await self._open_station()
+            await self._open_vehicles()
         if self._intake is not None:
             self._intake.start()
 
-    async def _open_station(self) -> "Station":
+    async def _open_vehicles(self) -> "VehicleManager":
         async with self._opening:
-            if self._station is not None:
-                return self._station
+            if self._vehicles is not None:
+                return self._vehicles
             # pymavlink's dialect costs 15 MB and 30 ms: only gateways with vehicles pay for it.
             from appliance.robots.mavlink.vehicle_manager import VehicleManager  # noqa: PLC0415
 
-            station = VehicleManager(
+            vehicles = VehicleManager(
                 self._config,
                 session=self._session,
                 store=self._store,
@@ -90,28 +90,28 @@ class RobotHub:
                 tasks=self._tasks,
                 gate=self._gate,
             )
-            await station.start()
-            self._station = station
-            return station
+            await vehicles.start()
+            self._vehicles = vehicles
+            return vehicles
 
     # --- links at run time: the verbs robot_links, robot_link_add, robot_link_remove ---------------------------
 
     async def links(self, ask: LinksAsk) -> LinkList:
         """All MAVLink links of this gateway, and what went over them."""
         del ask
-        return LinkList(gateway=self._gateway) if self._station is None else self._station.link_list()
+        return LinkList(gateway=self._gateway) if self._vehicles is None else self._vehicles.link_list()
 
     async def add_link(self, ask: LinkAdd) -> LinkFacts:
         """Open a link and keep it over restarts; ConfigError or RefusedError when it cannot be."""
         ask.link.check()
-        station = await self._open_station()
-        return await station.links.add(ask.link, by=ask.by)
+        vehicles = await self._open_vehicles()
+        return await vehicles.links.add(ask.link, by=ask.by)
 
     async def remove_link(self, ask: LinkRemove) -> LinkFacts:
         """Close a link for good; NotFoundError when there is none of that name."""
-        if self._station is None:
+        if self._vehicles is None:
             raise NotFoundError(f"no MAVLink link {ask.url[:120]!r}", remedy="this gateway has none")
-        return await self._station.links.remove(ask.url, by=ask.by)
+        return await self._vehicles.links.remove(ask.url, by=ask.by)
 
     async def forget(self, ask: RobotForget) -> Forgotten:
         """Remove the row of a robot that is offline, here and in every roster: the verb robot_forget.
@@ -125,10 +125,10 @@ class RobotHub:
         known = self._roster.get(name)
         if not mine and known is None:
             raise NotFoundError(f"no robot {name!r}", remedy="see `swiftbot robots`")
-        if (known is not None and known.online) or (self._station is not None and self._station.online(name)):
+        if (known is not None and known.online) or (self._vehicles is not None and self._vehicles.online(name)):
             raise RefusedError(f"{name} is online", remedy="switch it off, or remove its link, first")
-        if self._station is not None:
-            await self._station.forget(name)
+        if self._vehicles is not None:
+            await self._vehicles.forget(name)
         # A deleted key is what every roster knows a removed row by.
         self._session.delete(self._session.keys.robot(name))
         log.info("robot forgotten", robot=name, by=ask.by[:120])
@@ -138,6 +138,6 @@ class RobotHub:
         """End commands (the next process resumes them), take back what was declared, close the ports."""
         if self._intake is not None:
             self._intake.stop()
-        if self._station is not None:
-            await self._station.stop()
-            self._station = None
+        if self._vehicles is not None:
+            await self._vehicles.stop()
+            self._vehicles = None

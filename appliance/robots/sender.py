@@ -39,7 +39,7 @@ async def send_command(
 ) -> RobotReply:
     """Give a robot a command and wait for what comes of it.
 
-    The same id is sent again as `patience` says, so a lost query, a restarting gateway and a second caller with the
+    The same id is sent again as `retry` says, so a lost query, a restarting gateway and a second caller with the
     same command do no harm. Cancelled, at its deadline, or given up, it tells the robot to stop that command.
 
     `doubtful`: more than one may go by that name, and each would carry it out. Those that answer are counted first.

@@ -147,7 +147,7 @@ class Leasing:
     """The leases as this gateway knows them. `changed` is called when who has a robot is another.
 
     `refuses` says why a command may not be carried out just now: robots that speak Zenoh themselves do not know it.
-    `orders` holds it to the limits of its robot (`bounds`).
+    `orders` holds it to the limits of its robot (`limits`).
     """
 
     def __init__(

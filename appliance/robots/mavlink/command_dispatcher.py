@@ -269,11 +269,13 @@ class CommandDispatcher:
         name = protocols.check_name(args.name)
         patience = self._craft.patience
         if args.value is None:
-            return Done({"name": name, "value": await protocols.read(self._vehicle, name, patience=patience)})
+            return Done({"name": name, "value": await protocols.read_parameter(self._vehicle, name, patience=patience)})
         in_range("parameter", "value", args.value, -_LARGEST, _LARGEST)
         if self._vehicle.armed:
             raise RobotFailure("refused", f"{self._vehicle.name} is armed", remedy="write parameters while it stands")
-        return Done({"name": name, "value": await protocols.write(self._vehicle, name, args.value, patience=patience)})
+        return Done(
+            {"name": name, "value": await protocols.write_parameter(self._vehicle, name, args.value, patience=patience)}
+        )
 
     async def release(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Take the vehicle back from a pilot; a failsafe that is in force keeps it."""

@@ -1,6 +1,6 @@
 """What becomes of each good frame on a gateway's links: recorded, taken by the gateway itself, or passed on.
 
-Whose frames are believed, and which senders are vehicles, the station decides; here frames only come in and go out.
+The vehicle manager decides whose frames are believed and which senders are vehicles; here they only come in and go out.
 """
 
 import asyncio

@@ -382,7 +382,7 @@ class MissionServer:
     # --- what is asked -----------------------------------------------------------------------------------------
 
     def take(self, frame: Frame, *, robot: str, reply: Reply) -> None:
-        """Take a mission message that is for this gateway; arguments as `RequestDesk.take`."""
+        """Take a mission message that is for this gateway; arguments as `CommandServer.take`."""
         message = frame.message
         sender = (frame.system, frame.component)
         kind = int(getattr(message, "mission_type", MISSION))

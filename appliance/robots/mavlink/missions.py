@@ -256,7 +256,7 @@ class Missions:
         """Whether entering the mode begins the mission anew (ArduPilot's MIS_RESTART); False where it is not told."""
         patience = RetryPolicy(timeout_s=self._craft.patience.timeout_s, tries=_ASKED)
         try:
-            return await protocols.read(self._craft.vehicle, "MIS_RESTART", patience=patience) != 0
+            return await protocols.read_parameter(self._craft.vehicle, "MIS_RESTART", patience=patience) != 0
         except RobotFailure:
             return False  # another autopilot, or a lossy link: `_stay_at` sees to it
 

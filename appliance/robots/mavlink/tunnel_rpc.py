@@ -143,7 +143,7 @@ class TunnelServer:
         await asyncio.gather(*self._at_work, return_exceptions=True)
 
     def take(self, frame: Frame, *, asker: str = "", reply: Callable[[Message], None]) -> None:
-        """Take a TUNNEL frame of this protocol that is for this gateway; arguments as `RequestDesk.take`."""
+        """Take a TUNNEL frame of this protocol that is for this gateway; arguments as `CommandServer.take`."""
         message = frame.message
         key = (frame.system, frame.component)
         sender = self._senders.get(key)

@@ -164,16 +164,16 @@ def test_the_page_of_the_contract_has_the_figures_of_the_code() -> None:
     """What authors of robots read is what gateways and the check do."""
     page = " ".join((Path(__file__).parents[3] / "docs/robot-contract.md").read_text(encoding="utf-8").split())
     for text in (
-        f"still under way after {patience.LONG_POLL_S:g} s",
-        f"{patience.FIRST_SILENCE_S:g} s without a word, then the same command is asked again",
-        f"{patience.MOST_GONE_S:g} … s (up to a quarter less), given up after {patience.UNREACHABLE_S:g} s",
-        f"asked again after {patience.FIRST_SILENCE_S:g} s, given up after {patience.SILENT_S:g} s",
-        f"… {patience.MOST_QUICK_S:g} s, until the deadline",
-        f"is not, within {patience.CONFIRM_S:g} s",
+        f"still under way after {retry.LONG_POLL_S:g} s",
+        f"{retry.FIRST_SILENCE_S:g} s without a word, then the same command is asked again",
+        f"{retry.MOST_GONE_S:g} … s (up to a quarter less), given up after {retry.UNREACHABLE_S:g} s",
+        f"asked again after {retry.FIRST_SILENCE_S:g} s, given up after {retry.SILENT_S:g} s",
+        f"… {retry.MOST_QUICK_S:g} s, until the deadline",
+        f"is not, within {retry.CONFIRM_S:g} s",
         f"what is put in {conformance.WATCH_S:g} s",
         f"`state`, {conformance.STATES} times | each within {conformance.AT_ONCE_S:g} s",
         f"`hold` for {conformance.HOLD_S:g} s, asked twice meanwhile",
-        f"`hold` for {conformance.LONG_S:g} s | `deadline` within {patience.FIRST_SILENCE_S:g} s",
+        f"`hold` for {conformance.LONG_S:g} s | `deadline` within {retry.FIRST_SILENCE_S:g} s",
         f"within {conformance.NEAR_M:g} m of the goal",
         f"`{conformance.NO_VERB}`",
     ):

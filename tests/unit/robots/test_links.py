@@ -98,7 +98,7 @@ async def test_a_frame_in_pieces_and_garbage_over_tcp() -> None:
 
 async def test_an_end_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames for an end that does not read are dropped and counted; memory does not grow and nobody waits."""
-    monkeypatch.setattr("appliance.robots.mavlink.links.MAX_UNSENT", 1000)
+    monkeypatch.setattr("appliance.robots.mavlink.links.TCP_MAX_UNSENT", 1000)
     async with End.open(read_remote("tcp://127.0.0.1:0", listens=True), 1) as server:
         _, writer = await asyncio.open_connection(*server.link.address, limit=1)
         await until(lambda: bool(server.link.others))

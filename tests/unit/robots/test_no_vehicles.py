@@ -118,7 +118,7 @@ class Hub:
         self.hub = RobotHub(
             RobotsConfig(), session=wire, store=FakeStore(), gateway="gw-1", site=made._site, roster=self.roster
         )
-        self.hub._station = made
+        self.hub._vehicles = made
 
 
 async def test_a_robot_that_is_gone_can_be_forgotten() -> None:

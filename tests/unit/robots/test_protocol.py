@@ -231,14 +231,14 @@ async def test_parameters_are_read_and_written() -> None:
         return [make("PARAM_VALUE", param_id=name.encode(), **told)]
 
     fake = Fake(script)
-    assert await protocols.read(fake.vehicle, "WPNAV_SPEED", patience=PATIENCE) == 500.0
-    assert await protocols.write(fake.vehicle, "WPNAV_SPEED", 0.1, patience=PATIENCE) == pytest.approx(0.1)
+    assert await protocols.read_parameter(fake.vehicle, "WPNAV_SPEED", patience=PATIENCE) == 500.0
+    assert await protocols.write_parameter(fake.vehicle, "WPNAV_SPEED", 0.1, patience=PATIENCE) == pytest.approx(0.1)
     with pytest.raises(RobotFailure, match="keeps STUBBORN at 1 instead of 2"):
-        await protocols.write(fake.vehicle, "STUBBORN", 2.0, patience=PATIENCE)
+        await protocols.write_parameter(fake.vehicle, "STUBBORN", 2.0, patience=PATIENCE)
     with pytest.raises(RobotFailure, match="keeps the vehicle safe"):
-        await protocols.write(fake.vehicle, "FENCE_ENABLE", 0.0, patience=PATIENCE)
+        await protocols.write_parameter(fake.vehicle, "FENCE_ENABLE", 0.0, patience=PATIENCE)
     with pytest.raises(RobotFailure, match="does not tell NOTHING"):
-        await protocols.read(fake.vehicle, "NOTHING", patience=PATIENCE)
+        await protocols.read_parameter(fake.vehicle, "NOTHING", patience=PATIENCE)
     for wrong in ("", "no spaces", "WAY_TOO_LONG_A_NAME", "Ä"):
         with pytest.raises(RobotFailure, match="is no name"):
             protocols.check_name(wrong)

@@ -346,11 +346,11 @@ class Px4:
 
     async def read(self, name: str) -> float:
         """Read one as the gateway does."""
-        return await protocols.read(self.fake.vehicle, name, patience=PATIENCE)
+        return await protocols.read_parameter(self.fake.vehicle, name, patience=PATIENCE)
 
     async def write(self, name: str, value: float) -> float:
         """Write one as the gateway does."""
-        return await protocols.write(self.fake.vehicle, name, value, patience=PATIENCE)
+        return await protocols.write_parameter(self.fake.vehicle, name, value, patience=PATIENCE)
 
 
 @pytest.mark.parametrize("value", [0, 1, 5, -1, 1_065_353_216, 2**31 - 1, -(2**31)])
@@ -385,7 +385,7 @@ async def test_ardupilots_whole_numbers_are_cast() -> None:
     """
     told = {"param_value": 5.0, "param_type": 6, "param_count": 2, "param_index": 0}
     fake = Fake(lambda _: [make("PARAM_VALUE", param_id=b"SYSTEM", **told)])
-    assert await protocols.read(fake.vehicle, "SYSTEM", patience=PATIENCE) == 5.0
+    assert await protocols.read_parameter(fake.vehicle, "SYSTEM", patience=PATIENCE) == 5.0
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
