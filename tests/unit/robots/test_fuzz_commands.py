@@ -11,8 +11,8 @@ from msgspec import Struct
 
 from appliance.robots.mavlink.command_server import REPEAT_S
 from tests.unit.robots.conftest import FakeStore
+from tests.unit.robots.test_command_server import ACCEPTED, DENIED, IN_PROGRESS
 from tests.unit.robots.test_repetitions import Timed
-from tests.unit.robots.test_requests import ACCEPTED, DENIED, IN_PROGRESS
 
 pytestmark = pytest.mark.anyio
 

@@ -17,7 +17,7 @@ from appliance.model.plausible import plausible
 from appliance.plane.publishing import Message as Put
 from appliance.plane.roster import Roster
 from appliance.robots.task_listener import MAX_BYTES, read_request
-from tests.unit.robots.test_commands import Robot
+from tests.unit.robots.test_executor import Robot
 
 pytestmark = pytest.mark.anyio
 

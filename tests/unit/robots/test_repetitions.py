@@ -7,7 +7,7 @@ import pytest
 
 from appliance.robots.mavlink.command_server import REPEAT_S, task_number
 from tests.unit.robots.conftest import FakeStore
-from tests.unit.robots.test_requests import ACCEPTED, DENIED, IN_PROGRESS, TEMPORARILY_REJECTED, Fleet
+from tests.unit.robots.test_command_server import ACCEPTED, DENIED, IN_PROGRESS, TEMPORARILY_REJECTED, Fleet
 
 pytestmark = pytest.mark.anyio
 UNSET: dict[str, Any] = {f"param{number}": math.nan for number in range(2, 8)}

@@ -19,7 +19,8 @@ from appliance.robots.mavlink.mission_server import UnfitItem, plan_of
 from appliance.robots.mavlink.protocols import RetryPolicy, command
 from appliance.robots.verbs import RobotFailure, in_range
 from tests.unit.robots.conftest import FakeStore
-from tests.unit.robots.test_mission_desk import (
+from tests.unit.robots.test_command_server import IN_PROGRESS, TEMPORARILY_REJECTED, Fleet
+from tests.unit.robots.test_mission_server import (
     ACCEPTED,
     CANCELLED,
     INVALID_SEQUENCE,
@@ -31,8 +32,7 @@ from tests.unit.robots.test_mission_desk import (
     Ground,
     item,
 )
-from tests.unit.robots.test_protocol import BEAT, PATIENCE, Fake, ack
-from tests.unit.robots.test_requests import IN_PROGRESS, TEMPORARILY_REJECTED, Fleet
+from tests.unit.robots.test_protocols import BEAT, PATIENCE, Fake, ack
 
 pytestmark = pytest.mark.anyio
 LOITER = 17
