@@ -37,6 +37,8 @@ from appliance.robots.verbs import RobotFailure, StopArgs, args_of, parse_args
 
 log = structlog.get_logger(__name__)
 
+# --- idempotency log -------------------------------------------------------------------------------------------------
+
 MAX_BLOB_BYTES = 64 * 2**20
 """Of all remembered replies of one robot; pictures of the oldest are forgotten first."""
 
@@ -180,6 +182,8 @@ class IdempotencyLog:
 def _size(entry: Entry) -> int:
     return 0 if entry.reply is None else sum(len(blob) for blob in entry.reply.blobs.values())
 
+
+# --- executor --------------------------------------------------------------------------------------------------------
 
 UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 """What comes of bytes that are no JSON of the kind; the last: nested a thousand deep."""

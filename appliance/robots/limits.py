@@ -38,6 +38,8 @@ from appliance.robots.verbs import (
     parse_args,
 )
 
+# --- limits of the site: pure ----------------------------------------------------------------------------------------
+
 _SOFT_M = 1.0
 """How far a robot on its way may be in a forbidden area: what GPS errs and braking takes."""
 _CLOSE_S = 0.55
@@ -218,6 +220,8 @@ def _went_through(box: Box, before: Pose, pose: Pose, rim_m: float) -> bool:
 
 
 log = structlog.get_logger(__name__)
+
+# --- limits of an order ----------------------------------------------------------------------------------------------
 
 CHOSEN = frozenset({"speed_mps", "altitude_m"})
 """Values that a skill chooses where its plan says none."""

@@ -46,6 +46,8 @@ from appliance.robots.task_listener import Tasks
 
 log = structlog.get_logger(__name__)
 
+# --- progress of tasks -----------------------------------------------------------------------------------------------
+
 MAX_FOLLOWED = 1000
 """Tasks whose senders are told how they go on; the oldest is forgotten first."""
 _LOOK_S = 1.0
@@ -154,6 +156,8 @@ class Progress:
             del self._waiting[task]
             self.news(record)
 
+
+# --- server ----------------------------------------------------------------------------------------------------------
 
 ASK, CANCEL = dialect.constant("MAV_CMD_USER_1"), dialect.constant("MAV_CMD_USER_2")
 MISSION = dialect.MISSION_START

@@ -34,6 +34,8 @@ from pymavlink.dialects.v20 import ardupilotmega as _dialect
 
 from appliance.robots.mavlink.signing import SIGNATURE_BYTES, SIGNED_FLAG, Signer, wall_ticks
 
+# --- messages --------------------------------------------------------------------------------------------------------
+
 Message = Any
 """A pymavlink message, or a `CommandCancel`: fields by name."""
 
@@ -150,6 +152,8 @@ def decode(raw: bytes) -> Message:
         return CommandCancel.read(raw[start : start + raw[1]])
     return _decoder.decode(bytearray(raw))
 
+
+# --- frames ----------------------------------------------------------------------------------------------------------
 
 MARKER_V2 = 0xFD
 MARKER_V1 = 0xFE
@@ -270,6 +274,8 @@ def as_v1(raw: bytes) -> bytes:
     body = bytes((length, sequence, system, component, number)) + payload
     return bytes((MARKER_V1,)) + body + checksum(body + KINDS[number].extra).to_bytes(2, "little")
 
+
+# --- frames in streams -----------------------------------------------------------------------------------------------
 
 LONGEST = 280
 """Bytes of the longest frame."""
@@ -491,6 +497,9 @@ class Reader:
         return stop if good else None
 
 
+# --- encoder and decoder of a link -----------------------------------------------------------------------------------
+
+
 class Codec:
     """Decoder and encoder of one link. `system` and `component` are what it sends as.
 
@@ -626,6 +635,8 @@ def label(enum: str, value: int) -> str:
     entry: Any = enums.get(enum, {}).get(value)
     return str(value) if entry is None else str(entry.name)
 
+
+# --- numbers by their names ------------------------------------------------------------------------------------------
 
 ARM = constant("MAV_CMD_COMPONENT_ARM_DISARM")
 TAKEOFF = constant("MAV_CMD_NAV_TAKEOFF")

@@ -36,6 +36,8 @@ Address = tuple[str, int]
 """Host and port of the other end; of a serial link its device and 0."""
 
 
+# --- statistics: pure ------------------------------------------------------------------------------------------------
+
 MAX_SENDERS = 256
 """Of one link; the longest silent is forgotten first."""
 MAX_ASKED = 8
@@ -210,6 +212,8 @@ class Limiter:
         return found
 
 
+# --- links -----------------------------------------------------------------------------------------------------------
+
 _BUSY_S = 0.005
 
 
@@ -346,6 +350,8 @@ class Link(abc.ABC):
 
 
 log = structlog.get_logger(__name__)
+
+# --- UDP -------------------------------------------------------------------------------------------------------------
 
 UDP_MAX_UNSENT = 256 * 1024
 """Bytes of datagrams that may wait for the system to take them; more are dropped, as on a radio link."""
@@ -508,6 +514,8 @@ class UdpClient(Link):
             self._keeping = None
 
 
+# --- TCP -------------------------------------------------------------------------------------------------------------
+
 TCP_MAX_CONNECTIONS = 64
 """Of one listening port; more are refused and counted."""
 TCP_MAX_UNSENT = 256 * 1024
@@ -662,6 +670,8 @@ class TcpClient(_TcpLink):
             self._keeping = None
 
 
+# --- serial ----------------------------------------------------------------------------------------------------------
+
 SERIAL_RETRY_S = 1.0
 """How often a device that is not there is looked for: it is seen within a second of being plugged in."""
 SERIAL_MAX_READ = 4096
@@ -813,6 +823,8 @@ def _open_serial(path: str, baud: int) -> int:
         raise
     return fd
 
+
+# --- open ------------------------------------------------------------------------------------------------------------
 
 _KINDS: dict[tuple[str, bool], type[Link]] = {
     ("udp", True): UdpServer,

@@ -39,6 +39,8 @@ from appliance.robots.mavlink import dialect, statustext
 from appliance.robots.mavlink.dialect import Frame, Message, constant, label, make
 from appliance.robots.settings import RobotsConfig
 
+# --- plans of missions: pure -----------------------------------------------------------------------------------------
+
 MAX_PICTURES = 10
 MAX_LAPS = 20
 MAX_HOLD_S = 3600.0
@@ -289,6 +291,8 @@ def _number(number: int, item: Item, place: int, *, low: float, high: float, usu
 
 
 log = structlog.get_logger(__name__)
+
+# --- server ----------------------------------------------------------------------------------------------------------
 
 MISSION_MESSAGES = frozenset(
     (

@@ -429,6 +429,8 @@ def _item(message: Message) -> Item:
     )
 
 
+# --- parameters ------------------------------------------------------------------------------------------------------
+
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 SAFETY = ("FENCE_", "FS_", "ARMING_", "BRD_SAFETY", "BATT_FS", "MAV_GCS", "SYSID_", "RTL_ALT", "SIM_")
 """What a gateway does not write: with these an autopilot keeps itself safe when all else has failed."""

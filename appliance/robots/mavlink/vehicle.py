@@ -42,6 +42,8 @@ from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.statustext import REFUSAL_SEVERITY, Said, Texts
 
+# --- modes -----------------------------------------------------------------------------------------------------------
+
 
 class Modes(Struct, frozen=True, kw_only=True):
     """The modes of a kind of vehicle, and which of them the gateway uses for what."""
@@ -133,6 +135,8 @@ def modes_of(autopilot: int, kind: int) -> Modes | None:
         return COPTER
     return ROVER if kind in GROUND else None
 
+
+# --- condition -------------------------------------------------------------------------------------------------------
 
 _ESTIMATOR = {
     0x01: "no attitude",
@@ -227,6 +231,8 @@ def estimator(flags: int) -> tuple[str, ...]:
         missing.append("GPS glitch")
     return tuple(missing)
 
+
+# --- control authority -----------------------------------------------------------------------------------------------
 
 OVERRIDES = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})
 """Messages by which a ground station moves a vehicle's sticks."""
@@ -387,6 +393,8 @@ def _failsafe(words: str, mode: str) -> str:
     return f"{words}: it is in {mode}" if words == "failsafe" else f"failsafe: {words}, it is in {mode}"
 
 
+# --- track -----------------------------------------------------------------------------------------------------------
+
 _KEPT = 64
 """Reports: six seconds at 10 Hz, far more than passes between two looks."""
 _CLOCK_MS = 2**32
@@ -430,6 +438,8 @@ class Track:
         """Return the reports that came after so many, behind the last one before them."""
         return list(self._reports)[-(self.count - count + 1) :]
 
+
+# --- vehicle ---------------------------------------------------------------------------------------------------------
 
 Address = tuple[str, int]
 
