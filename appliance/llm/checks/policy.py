@@ -2,7 +2,7 @@
 
 What a plan does not say counts as far as it is known: the skill's usual value (`Param.usual` of its manifest), the home
 that a robot has told. Speeds and take-off heights that a skill chooses are lowered when they are sent
-(`robots.bounds`); for how long it does something has to be said where its usual time is above a limit, or not known.
+(`robots.limits`); for how long it does something has to be said where its usual time is above a limit, or not known.
 """
 
 from collections.abc import Iterable, Sequence
