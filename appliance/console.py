@@ -34,8 +34,7 @@ from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
 from appliance.pool.transfer.api import Brought
 from appliance.reasons import milliseconds
-from appliance.record.facts import LogInfo
-from appliance.record.heard import kinds_text, problem_of, together
+from appliance.record.models import LogInfo, kinds_text, problem_of, together
 from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
 from appliance.tasks.check import CheckReport

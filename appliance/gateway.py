@@ -43,8 +43,7 @@ from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
-from appliance.record.facts import RecorderStatus
-from appliance.record.heard import Recorders
+from appliance.record.models import Recorders, RecorderStatus
 from appliance.robot_tasks import RobotTasks
 from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.authority.authority import SHOWN, Authority

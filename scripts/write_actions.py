@@ -16,7 +16,7 @@ from write_configuration import fields
 
 from appliance.tui import themes
 from appliance.tui.actions import ACTIONS, SCREENS
-from appliance.tui.keys import names
+from appliance.tui.actions import names
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "tui.md"

@@ -57,7 +57,7 @@ async def run(order: Order, *, asks: Sequence[str], tui: bool = False, keep: boo
                 record = await _one(client, ask)
                 good = good and record.state is TaskState.SUCCEEDED
         if tui:
-            from appliance.tui.running import run_tui  # noqa: PLC0415 - Textual is only wanted here
+            from appliance.tui.app import run_tui  # noqa: PLC0415 - Textual is only wanted here
 
             await run_tui(PlaneConfig(mode="client", connect=state.endpoints), state.fleet)
     finally:

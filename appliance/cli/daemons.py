@@ -80,8 +80,8 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
     """
     from appliance import config as configuration
     from appliance.plane.settings import PlaneConfig
-    from appliance.record.about import about
     from appliance.record.recorder import run_recorder
+    from appliance.record.segments import about
     from appliance.record.settings import RecordConfig
     from appliance.skills.sites import load_site
 
@@ -128,8 +128,8 @@ def foxglove(
     """
     from appliance import config as configuration
     from appliance.plane.settings import PlaneConfig
-    from appliance.record.about import about
-    from appliance.record.live import LiveOptions, serve
+    from appliance.record.foxglove_bridge import LiveOptions, serve
+    from appliance.record.segments import about
     from appliance.skills.sites import load_site
 
     told = about({}, os.environ)

@@ -50,7 +50,7 @@ def _named(paths: tuple[Path, ...]) -> None:
 
 def _select(paths: tuple[Path, ...], keys: tuple[str, ...], without: tuple[str, ...], since: str, until: str) -> Any:
     from appliance.record.edit import Select, instant, span
-    from appliance.record.expressions import check_expression
+    from appliance.record.models import check_expression
 
     _named(paths)
     for each in (*keys, *without):
@@ -128,7 +128,7 @@ def log_cat(
     Args:
         paths: The logs, one after the other.
     """
-    from appliance.record.cat import cat
+    from appliance.record.edit import cat
 
     select = _select(paths, keys, without, since, until)
     try:
@@ -154,7 +154,7 @@ def log_pin(
         remove: Unpin them.
         as_json: Print JSON.
     """
-    from appliance.record.budget import pin
+    from appliance.record.retention import pin
 
     for path in paths:
         pin(path, pinned=not remove)
@@ -196,7 +196,7 @@ def log_trigger(reason: str, *, by: str = "", wait: float = 5.0, as_json: Json =
         as_json: Print JSON.
         where: The fleet.
     """
-    from appliance.record.asking import trigger
+    from appliance.record.remote_control import trigger
 
     endpoint = where.endpoint()
     told = asyncio.run(
@@ -246,8 +246,8 @@ def log_replay(
         paths: The logs; several are played together, by time.
         as_json: Print what came of it as JSON.
     """
-    from appliance.record.asking import replay
     from appliance.record.player import PlayOptions, check_rate, parse_remap
+    from appliance.record.remote_control import replay
 
     select = _select(paths, keys, without, since, until)
     options = PlayOptions(

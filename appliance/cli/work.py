@@ -259,7 +259,7 @@ def tui(
     """Open the terminal UI on a fleet or on a recorded log, here or in a browser."""
     from appliance.plane.settings import PlaneConfig
     from appliance.tui import settings
-    from appliance.tui.running import run_tui
+    from appliance.tui.app import run_tui
 
     own = settings.load(config)
     own = msgspec.structs.replace(own, write=own.write or write, theme=theme or own.theme)
@@ -283,7 +283,7 @@ def tui(
 
 def _serve_tui(endpoint: Endpoint, *, port: int, options: list[str]) -> None:
     """Serve the terminal UI until SIGTERM or Ctrl-C."""
-    from appliance.tui.serve.running import serve
+    from appliance.tui.serve import serve
 
     async def go() -> None:
         stop = asyncio.Event()

@@ -14,8 +14,7 @@ import msgspec
 from msgspec import Struct
 
 from appliance.plane.keys import Keys
-from appliance.record.expressions import compile_expression
-from appliance.record.facts import Incident, LoggedMessage, Trigger
+from appliance.record.models import Incident, LoggedMessage, Trigger, compile_expression
 
 EVERY = "every"
 """Recorder's name in a trigger that is meant for all recorders."""

@@ -2,29 +2,250 @@
 
 One thread hands over what Zenoh has queued to a bounded intake, another encodes, compresses and syncs. What does
 not fit is dropped, counted and written down in the log itself as a gap: a log that lacks something says so.
+
+`Pipeline` runs on the writer thread, a message at a time in the order of arrival: secrets out, holes noticed, incidents
+marked, and held back if asked. What is asked of a key (does it have numbers, can it tell of an incident, is it JSON) is
+worked out once a key. `Sequences` detects messages that never came by the numbers of those kinds that have one: log
+lines of a gateway, events of a run, transitions of a task, frames of a MAVLink component (one byte, so a loss of 256 in
+a row does not show).
 """
 
 import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
 
+import msgspec
 import structlog
 from msgspec import Struct, structs
 
 from appliance.errors import RecordError
 from appliance.model import encode
 from appliance.plane.backlog import kind_of
+from appliance.plane.keys import Keys
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
-from appliance.record.about import About
-from appliance.record.catching_up import CatchingUp, Tail, tail_of
-from appliance.record.facts import LoggedMessage, RecorderStatus
-from appliance.record.following import Lost
-from appliance.record.pipeline import Pipeline
+from appliance.record.backfill import CatchingUp, Lost, Tail, tail_of
+from appliance.record.incidents import Gate, Triggers
+from appliance.record.models import Incident, LoggedMessage, RecorderStatus, compile_expression
+from appliance.record.redact import Redactor
+from appliance.record.segments import NOT_HEARD, PLANE, VEHICLE, About, Attached, LogWriter, file_prefix
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import NOT_HEARD, PLANE, LogWriter, file_prefix
+
+MOST_SOURCES = 20_000
+"""Speakers whose numbers are remembered; the one that was silent for longest is forgotten first."""
+_V1, _V2 = 0xFE, 0xFD
+_WINDOW = 256
+_RESTARTED = 3
+"""So many frames in a row that follow each other, and not the last one, are of a component that began again."""
+_UNHEARD = (-1, -1, 0)
+
+
+class _Numbered(Struct):
+    """A message's own numbers: what it tells about may have such fields as well."""
+
+    number: int = -1
+    sequence: int = -1
+    attempt: int = 0
+    coordinator: str = ""
+
+
+class Hole(Struct, frozen=True):
+    """So many messages are missing before the one that was just heard."""
+
+    source: str
+    missing: int
+    key: str
+
+
+class Sequences:
+    """Notices holes in the numbers of one fleet's speakers."""
+
+    def __init__(self, keys: Keys) -> None:
+        self._last: OrderedDict[tuple[str, str], tuple[int, int, int]] = OrderedDict()
+        """The last number of each, the last one that came behind it, and how many of those came in a row."""
+        self._kinds = (
+            (compile_expression(keys.transition()), "transition"),
+            (compile_expression(keys.run()), "run"),
+            (compile_expression(keys.log()), "log"),
+            # Not of what is sent: each other end is told a part of it.
+            (compile_expression(keys.mavlink(direction="rx")), "mavlink"),
+            (compile_expression(keys.link_frames(direction="rx")), "mavlink"),
+        )
+        self.missing: dict[str, int] = {}
+        """Messages not heard so far, by kind."""
+
+    def kind_of(self, key: str) -> str:
+        """Return which numbers messages of a key have; "" for none. To be asked once a key."""
+        return next((kind for pattern, kind in self._kinds if pattern.fullmatch(key)), "")
+
+    def heard(self, kind: str, key: str, payload: bytes) -> Hole | None:
+        """Note a message; returns the hole before it, if there is one."""
+        if kind == "mavlink":
+            return self._frame(key, payload)
+        try:
+            told = msgspec.json.decode(payload, type=_Numbered)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            return None
+        number, source = (told.sequence, told.coordinator[:80]) if kind == "transition" else (told.number, "")
+        if kind == "run":
+            source = str(told.attempt)
+        if number < 0:
+            return None
+        last = self._note((key, source), number)
+        # A new coordinator goes on from a record, a new process counts anew: neither is a hole.
+        if last is None or number <= last + 1:
+            return None
+        return self._hole(kind, number - last - 1, key)
+
+    def _frame(self, key: str, payload: bytes) -> Hole | None:
+        if len(payload) >= 10 and payload[0] == _V2:
+            number, speaker = payload[4], f"{payload[5]}/{payload[6]}"
+        elif len(payload) >= 6 and payload[0] == _V1:
+            number, speaker = payload[2], f"{payload[3]}/{payload[4]}"
+        else:
+            return None
+        source = (key, speaker)
+        last, late, run = self._last.get(source, _UNHEARD)
+        ahead = (number - last) % _WINDOW
+        if last < 0 or 0 < ahead <= _WINDOW // 2:
+            self._note(source, number)
+            return self._hole("mavlink", ahead - 1, key) if last >= 0 and ahead > 1 else None
+        # Behind: one that was overtaken, or is told again; or its speaker has begun again, as some in a row show.
+        run = run + 1 if number == (late + 1) % _WINDOW else 1
+        if run < _RESTARTED:
+            self._note(source, last, late=number, run=run)
+        else:
+            self._note(source, number)
+        return None
+
+    def _note(self, source: tuple[str, str], number: int, *, late: int = -1, run: int = 0) -> int | None:
+        """Remember what was heard last of a source; returns what was before."""
+        last, _, _ = self._last.pop(source, _UNHEARD)
+        self._last[source] = (number, late, run)
+        if len(self._last) > MOST_SOURCES:
+            self._last.popitem(last=False)
+        return None if last < 0 else last
+
+    def _hole(self, kind: str, missing: int, key: str) -> Hole:
+        self.missing[kind] = self.missing.get(kind, 0) + missing
+        return Hole(kind, missing, key)
+
+
+MOST_KEYS = 50_000
+"""Keys whose plan is remembered; beyond, all are worked out anew. Each task has some of its own."""
+_PLAN = b'"plan"'
+
+
+class _Way(Struct, frozen=True):
+    """What is to be done with the messages of a key."""
+
+    raw: bool
+    numbers: str
+    incident: str
+    plans: bool
+
+
+class _Planned(Struct):
+    task: str = ""
+    sequence: int = 0
+    plan: msgspec.Raw = msgspec.Raw()
+
+
+class Pipeline:
+    """What a recorder does with each message.
+
+    Args:
+        config: mode and times.
+        fleet: whose messages.
+        writer: gets what is to be in the log.
+        secrets: values that must not be (see `redact`).
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        config: RecordConfig,
+        *,
+        fleet: str,
+        writer: LogWriter,
+        secrets: Iterable[str] = (),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        keys = Keys(fleet)
+        self.writer = writer
+        self.redactor = Redactor(secrets)
+        self.gate = Gate(
+            always=config.mode == "all",
+            before_s=config.before_s,
+            after_s=config.after_s,
+            ring_bytes=config.ring_bytes,
+        )
+        self._sequences = Sequences(keys)
+        self._triggers = Triggers(keys, config.name)
+        self._clock = clock
+        self._ways: dict[str, _Way] = {}
+        self._raw = tuple(map(compile_expression, (keys.mavlink(), keys.link_frames(), keys.camera())))
+        self._transitions = compile_expression(keys.transition())
+
+    def write(self, message: LoggedMessage) -> None:
+        """Take a message on its way."""
+        way = self._ways.get(message.key) or self._way_of(message.key)
+        payload = message.payload
+        clean = self.redactor.text(payload) if way.raw else self.redactor.json(payload)
+        if clean is not payload:
+            message = LoggedMessage(message.key, message.at_ns, clean, message.encoding, message.deleted)
+        # A session that numbers what it puts is followed by those numbers, of whatever key; a vehicle has its own.
+        if way.numbers and not message.deleted and (not message.number or way.numbers == VEHICLE):
+            hole = self._sequences.heard(way.numbers, message.key, clean)
+            if hole is not None:
+                self.writer.miss(hole.source, hole.missing, hole.key, message.at_ns)
+        incident = self._triggers.incident(way.incident, message) if way.incident else None
+        if incident is not None:
+            self._happened(incident)
+        if self.gate.always or self.gate.take(message, self._clock()):
+            self._log(message, way)
+
+    def tick(self) -> None:
+        """See to files that are due; end the one of an incident that is over."""
+        if not self.gate.open(self._clock()) and self.writer.recording:
+            self.writer.close()
+        self.writer.tick()
+
+    def _happened(self, incident: Incident) -> None:
+        incident, before = self.gate.happened(incident, self._clock())
+        for each in before:
+            self._log(each, self._ways.get(each.key) or self._way_of(each.key))
+        self.writer.mark(incident)
+
+    def _log(self, message: LoggedMessage, way: _Way) -> None:
+        if way.plans and _PLAN in message.payload:
+            self._attach_plan(message)
+        self.writer.write(message)
+
+    def _attach_plan(self, message: LoggedMessage) -> None:
+        try:
+            told = msgspec.json.decode(message.payload, type=_Planned)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            return
+        if bytes(told.plan) not in (b"", b"null"):
+            name = f"plan-{told.task[:80]}-{told.sequence}.json"
+            self.writer.attach(Attached(name, "application/json", bytes(told.plan)))
+
+    def _way_of(self, key: str) -> _Way:
+        way = _Way(
+            raw=any(each.fullmatch(key) for each in self._raw),
+            numbers=self._sequences.kind_of(key),
+            incident=self._triggers.watches(key),
+            plans=self._transitions.fullmatch(key) is not None,
+        )
+        if len(self._ways) >= MOST_KEYS:
+            self._ways.clear()
+        self._ways[key] = way
+        return way
+
 
 log = structlog.get_logger(__name__)
 

@@ -19,7 +19,7 @@ from appliance.errors import ConflictError, PayloadError, SwiftbotError, Unreach
 from appliance.model import TaskRecord, encode
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
-from appliance.record.facts import RecorderStatus
+from appliance.record.models import RecorderStatus
 from appliance.tasks import checkpoints
 from appliance.tasks.bounds import read_record
 from appliance.tasks.recorded import LogFiles, Span

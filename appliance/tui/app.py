@@ -1,25 +1,339 @@
-"""The terminal UI itself: what its own actions do, screens and dialogs, and the change to a recorded log and back."""
+"""The terminal UI itself: the window, its screens and dialogs, what becomes of keys and commands, and how it is run.
 
+`Shell` is Textual's part, nothing else: which screens there are, when the one that is seen is drawn, and in which
+colours. It works at 80 columns by 24 lines over SSH, draws a few times a second and only what changed, and never stops
+because the network does. `Ordering` takes what a person wants from key or command line to what came of it: asked,
+allowed, confirmed, carried out, told. `SwiftbotApp` adds what the UI's own actions do, and the change to a recorded log
+and back. `run_tui` runs it in a terminal until the person leaves, `export_picture` without one for a picture of it.
+"""
+
+import contextlib
+import re
+import time
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from textual.app import SystemCommand
+import structlog
+from rich.console import RenderableType
+from textual.app import App, SystemCommand
+from textual.css.query import NoMatches
 from textual.screen import Screen
+from textual.widgets import Input
 
-from appliance.errors import SwiftbotError
+from appliance.collector import gentle_collector
+from appliance.errors import ConfigError, SwiftbotError, UnreachableError
+from appliance.llm.stop_words import stop_request
 from appliance.model import Approval, TaskRecord
-from appliance.tui import actions, themes
-from appliance.tui.action import key_name
-from appliance.tui.dialogs import ConfirmDialog
-from appliance.tui.help import HelpDialog
-from appliance.tui.keys import keys_of
-from appliance.tui.ordering import Ordering
-from appliance.tui.replay.source import ReplayView
-from appliance.tui.robots.takeover import TakeoverScreen
+from appliance.model.open_enum import enums_open
+from appliance.plane.settings import PlaneConfig
+from appliance.tui import actions, command_line, themes
+from appliance.tui.actions import PROMPTS, STOP_IN_WORDS, bindings, key_name, keymap, keys_of
+from appliance.tui.base_screen import FleetScreen
+from appliance.tui.command_line import Command
+from appliance.tui.replay import ReplayView
 from appliance.tui.safe import safe
-from appliance.tui.tasks.review import ReviewScreen
-from appliance.tui.tasks.submit import SubmitDialog
+from appliance.tui.screens import SCREENS
+from appliance.tui.screens.review import ReviewScreen
+from appliance.tui.screens.submit import History, SubmitDialog, default_file
+from appliance.tui.screens.takeover import TakeoverScreen
+from appliance.tui.settings import TuiConfig
+from appliance.tui.subscriptions import FleetView, View, take_own_log
+from appliance.tui.task_view import state_cell
+from appliance.tui.widgets import Lines
+from appliance.tui.widgets.dialogs import ConfirmDialog, HelpDialog, TextDialog
+
+_FONT = re.compile(r"@font-face \{[^}]*\}\s*")
+
+
+class Shell(App[None], inherit_bindings=False):
+    """A window on a view of a fleet: what is seen of it, when it is drawn, and in which colours.
+
+    Args:
+        view: What is shown; closed with the app.
+        config: How it looks and how often it is drawn.
+        history: Instructions submitted before; kept in memory alone when none is given.
+    """
+
+    TITLE = "SwiftBot"
+    BINDINGS = bindings()  # pyright: ignore[reportAssignmentType] - Textual wants a list of its own union
+    MODES = SCREENS  # pyright: ignore[reportAssignmentType] - of classes, which make themselves
+    DEFAULT_MODE = "fleet"
+    ENABLE_COMMAND_PALETTE: ClassVar[bool] = False
+    """Textual would bind ^p to it for good; it is there all the same, under the keys of the action `palette`."""
+    CSS = """
+    ModalScreen { align: center middle; }
+    .dialog { width: 90%; max-width: 110; height: 80%; border: round $accent; background: $surface; padding: 0 1; }
+    .small { height: auto; width: 60; }
+    .title { text-style: bold; }
+    #plan-box { height: 1fr; scrollbar-size: 1 1; }
+    #hint { color: $text-muted; }
+    VerticalScroll { scrollbar-size: 1 1; }
+    """
+
+    def __init__(self, view: View, config: TuiConfig | None = None, *, history: History | None = None) -> None:
+        self.config = config or TuiConfig()
+        self.config.check()
+        self._own_keys = keymap(self.config.keys)
+        if self.config.theme not in themes.BY_NAME:
+            known = ", ".join(themes.BY_NAME)
+            raise ConfigError(f"tui.theme is {self.config.theme!r}", remedy=f"there are: {known}")
+        self._look = ""
+        """The theme that styles were worked out for."""
+        super().__init__()
+        self.use_command_palette = True
+        self.view = view
+        self.history = history or History(None)
+        """Instructions submitted before."""
+        self.behind: View | None = None
+        """The fleet, while a recorded log is shown instead."""
+        self.lines = Lines()
+        """Command lines written before."""
+        self.unlocked = self.config.write and view.steerable
+        """Whether what changes the fleet is allowed."""
+        self.under_way: dict[str, None] = {}
+        """Orders that have not been answered yet, as command lines."""
+        self.wanted_task = ""
+        """A task that is to be selected as soon as it is shown."""
+        if not self.config.animation:
+            self.animation_level = "none"
+        for look in themes.LOOKS:
+            self.register_theme(look.theme())
+
+    async def on_mount(self) -> None:
+        """Begin to listen and to draw."""
+        self.set_look(self.config.theme)
+        self.set_keymap(self._own_keys)
+        await self.view.start()
+        if not self.view.steerable:
+            self.switch_mode("replay")
+        self.set_interval(1 / self.config.refresh_hz, self._tick)
+
+    async def on_unmount(self) -> None:
+        """End listening."""
+        await self.view.close()
+        if self.behind is not None:
+            await self.behind.close()
+
+    # --- drawing -----------------------------------------------------------------------------------------
+
+    @property
+    def front(self) -> FleetScreen | None:
+        """The screen that is seen, behind a dialog if there is one."""
+        return next((each for each in reversed(self.screen_stack) if isinstance(each, FleetScreen)), None)
+
+    def _tick(self) -> None:
+        # While the app ends, the timer may still fire when parts of the screen are gone.
+        with contextlib.suppress(NoMatches):
+            self.draw()
+
+    def draw(self, *, force: bool = False) -> None:
+        """Draw what is new on the screen that is seen; the others wait until they are."""
+        self.view.sync()
+        if (front := self.front) is not None:
+            front.flush(force=force)
+
+    def delay_update(self, delay: float = 0.05) -> None:
+        """Hold painting back while screens change; shorter than Textual does, since ours are drawn at once."""
+        super().delay_update(min(delay, 0.005))
+
+    def refresh_css(self, animate: bool = True) -> None:
+        """Work out the styles anew when the colours have changed.
+
+        Textual does so whenever a screen is shown for the first time as well, which is styled with these colours as it
+        is made: that took longer than all else of showing it.
+        """
+        screens = [each for each in self.screen_stack if isinstance(each, FleetScreen)]
+        for each in screens:
+            each.look = each.look or self._look
+        if self._look == self.theme and all(each.look == self.theme for each in screens):
+            return
+        super().refresh_css(animate)
+        self._look = self.theme
+        for each in screens:
+            each.look = self.theme
+
+    def get_theme_variable_defaults(self) -> dict[str, str]:
+        """Return variables that themes have beside Textual's: its own theme, until ours is set, lacks them."""
+        return {"cursor": themes.LOOKS[0].cursor}
+
+    def set_look(self, name: str) -> None:
+        """Change the colours."""
+        look = themes.BY_NAME[name]
+        self.ansi_theme_dark = self.ansi_theme_light = look.terminal()
+        self.theme = name
+
+    # --- what is told -----------------------------------------------------------------------------------------
+
+    def tell(self, error: SwiftbotError) -> None:
+        """Show an error with its remedy."""
+        remedy = f"\n→ {safe(error.remedy)}" if error.remedy else ""
+        self.notify(f"{safe(error.message)}{remedy}", title="Error", severity="error", timeout=10, markup=False)
+
+    def read(self, title: str, content: RenderableType) -> None:
+        """Show something to be read at leisure."""
+        self.push_screen(TextDialog(title, content))
+
+    def export_svg(self, path: Path) -> None:
+        """Write a picture of the screen as it is now, without references to fonts on other machines."""
+        path.write_text(_FONT.sub("", self.export_screenshot(title=f"SwiftBot · {self.view.fleet}")))
+
+
+log = structlog.get_logger(__name__)
+
+_UNSAID = ("stops", "robots", "unknown", "roster")
+"""Arguments that nobody has written."""
+
+
+class Ordering(Shell):
+    """A window that takes orders. What an action does here is a method `do_NAME` of a subclass."""
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Leave the keys of the prompt to whatever is being written, and to dialogs."""
+        if action == "act" and parameters and parameters[0] in PROMPTS:
+            return not isinstance(self.focused, Input) and isinstance(self.screen, FleetScreen)
+        return super().check_action(action, parameters)
+
+    def action_act(self, name: str) -> None:
+        """Do an action of the registry on what is selected."""
+        chosen = self.front.chosen() if self.front is not None else {}
+        self.begin(command_line.fill(actions.BY_NAME[name], {}, chosen))
+
+    def run_line(self, line: str) -> None:
+        """Do what a command line says."""
+        chosen = self.front.chosen() if self.front is not None else {}
+        try:
+            command = command_line.read(line, chosen)
+        except SwiftbotError as error:
+            self.tell(error)
+            return
+        self.begin(command)
+
+    def completions(self, line: str) -> tuple[str, ...]:
+        """Return command lines that go on from this one."""
+        return command_line.complete(line, self.view.store, {"theme": themes.BY_NAME})
+
+    @property
+    def _steered(self) -> View:
+        """Whom a stop is for: the fleet behind a recorded log that is shown, if there is one."""
+        return self.behind if self.behind is not None and not self.view.steerable else self.view
+
+    def begin(self, command: Command) -> None:
+        """Do an action, unless something is missing, the UI is read-only, or a person says no."""
+        action = command.action
+        if action.call == "submit" and self.stops_in_words(command.given.get("instruction", "")):
+            return
+        if action.writes and not (action.always and self._steered.steerable) and not self._allowed():
+            return
+        if command.missing:
+            self._ask_for(command)
+        elif action.call:
+            method, _, fixed = action.call.partition(" ")
+            getattr(self, f"do_{method}")(*([fixed] if fixed else []), command.given)
+        elif action.dangerous:
+            if action.sees_stops:
+                # Before the question: what is stopped while it is open was not seen.
+                command.given["stops"] = "/".join(each.id for each in self.view.store.stops.active)
+
+            def answered(yes: bool | None) -> None:
+                if yes:
+                    self.carry_out(command)
+
+            self.push_screen(ConfirmDialog(safe(action.sentence(command.given))), answered)
+        else:
+            self.carry_out(command)
+
+    def stops_in_words(self, text: str) -> bool:
+        """Carry a text out that is a soft stop, as the stop key does it, read-only as well; False when it is none."""
+        view = self._steered
+        roster = tuple(view.store.robots)
+        if not view.steerable or (stop := stop_request(text, roster)) is None:
+            return False
+        given = {"robots": "/".join(stop.robots), "unknown": "/".join(stop.unknown), "roster": "/".join(roster)}
+        self.carry_out(Command(action=STOP_IN_WORDS, given={**given, "why": text}))
+        return True
+
+    def _allowed(self) -> bool:
+        if not self.view.steerable:
+            self.notify("a recorded log cannot be steered", severity="warning")
+        elif not self.unlocked:
+            self.notify("read-only: W or `:write` unlocks", severity="warning")
+        else:
+            return True
+        return False
+
+    def _ask_for(self, command: Command) -> None:
+        """Have a person write what is missing; what is given stands there already.
+
+        Of the questions that wait the oldest is taken where none is selected, and who asks what is said beside it.
+        """
+        asked = self.view.store.enquiries
+        if any(each.kind == "enquiry" for each in command.missing):
+            waiting = [each for each in asked.values() if each.open]
+            if not waiting:
+                self.notify("nothing is asked")
+                return
+            oldest = min(waiting, key=lambda each: each.at_ns)
+            command = command_line.fill(command.action, command.given, {"enquiry": oldest.id})
+        words = [command.action.name]
+        for parameter in command.action.takes:
+            if parameter.name not in command.given:
+                break
+            words.append(command.given[parameter.name])
+        if self.front is not None:
+            note = f"{', '.join(each.name for each in command.missing)}? {command.action.usage}"
+            for parameter in command.action.takes:
+                if (
+                    parameter.kind == "enquiry"
+                    and (one := asked.get(command.given.get(parameter.name, ""))) is not None
+                ):
+                    note = f"{safe(one.robot or one.task or 'a skill', 40)} asks: {safe(one.question, 160)} · {note}"
+            self.front.prompt.open(":", " ".join(words) + " ", note)
+
+    def carry_out(self, command: Command) -> None:
+        """Ask something of the fleet in the background, and show what comes of it."""
+        words = (word for name, word in command.given.items() if name not in _UNSAID)
+        line = " ".join([command.action.name, *words])
+        if line in self.under_way:
+            self.notify(f"{safe(line, 80)}: under way already", severity="warning", markup=False)
+            return
+        self.under_way[line] = None
+        self.run_worker(self._carry_out(command, line), group="orders")
+
+    async def _carry_out(self, command: Command, line: str) -> None:
+        action = command.action
+        assert action.do is not None  # noqa: S101 - what has no call has this
+        view = self._steered if action.always else self.view
+        try:
+            answer = await action.do(view.orders, command.given, view.operator)
+        except SwiftbotError as error:
+            if action.always and isinstance(error, UnreachableError):
+                error.remedy = "stop the robots by their own means"
+            self.note(line, error.message, level="error")
+            self.tell(error)
+        except Exception as error:  # supervision boundary: one order's defect must not end the UI
+            log.exception("an order failed", order=line)
+            self.notify(f"internal error: {safe(repr(error), 200)}", severity="error", markup=False)
+        else:
+            if isinstance(answer, TaskRecord):
+                # It is heard as well, but perhaps later than the person looks.
+                self.view.store.take_task(answer)
+                answer = f"task {answer.id}: {state_cell(answer)[0]}"
+            if action.long:
+                self.push_screen(TextDialog(f":{safe(line, 80)}", answer))
+            else:
+                self.note(line, str(answer))
+                self.notify(safe(answer), markup=False)
+        finally:
+            self.under_way.pop(line, None)
+            with contextlib.suppress(NoMatches):  # an answer may come while the screen goes
+                self.draw()
+
+    def note(self, line: str, outcome: str, *, level: str = "info") -> None:
+        """Put an order and what came of it on the log screen."""
+        text = f":{line} → {outcome}"
+        self.view.store.add(time.time_ns(), kind="order", level=level, source=self.view.operator, text=text)
 
 
 class SwiftbotApp(Ordering):
@@ -217,3 +531,51 @@ class SwiftbotApp(Ordering):
                 self.action_act(name)
 
             yield SystemCommand(action.title, f"{action.help}{keys}", call)
+
+
+async def export_picture(
+    view: View, path: Path, *, keys: tuple[str, ...] = ("2",), size: tuple[int, int] = (100, 30)
+) -> None:
+    """Run the terminal UI without a terminal on `view`, press `keys`, write its picture to `path` as SVG.
+
+    Args:
+        view: What is shown.
+        path: SVG file to write.
+        keys: Keys pressed first, in Textual's names.
+        size: Columns and lines.
+    """
+    app = SwiftbotApp(view)
+    async with app.run_test(size=size) as pilot:
+        await pilot.pause()
+        await pilot.press(*keys)
+        await pilot.pause(0.5)
+        app.draw(force=True)
+        await pilot.pause()
+        app.export_svg(path)
+
+
+async def run_tui(
+    plane_config: PlaneConfig, fleet: str, config: TuiConfig | None = None, *, replay: Path | None = None
+) -> None:
+    """Run the terminal UI on a fleet, or on a recorded log, until the person leaves (`swiftbot tui`).
+
+    Log lines of this process go to its log screen meanwhile: on the terminal they would spoil the picture.
+
+    Raises:
+        ConfigError: a setting cannot work.
+        NotFoundError, RecordError: the recorded log cannot be read.
+    """
+    config = config or TuiConfig()
+    config.check()
+    view = FleetView(plane_config, fleet, config) if replay is None else await ReplayView.open(replay, config)
+    app = SwiftbotApp(view, config, history=History(default_file()))
+    before = structlog.get_config()
+    structlog.configure(
+        processors=[structlog.processors.add_log_level, partial(take_own_log, view.store)],
+        cache_logger_on_first_use=False,
+    )
+    try:
+        with enums_open(), gentle_collector():
+            await app.run_async()
+    finally:
+        structlog.configure(**before)

@@ -17,12 +17,12 @@ from appliance.model import GatewayStatus, LogLine, Pose, RobotInfo, Site, encod
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.ports import free_port
-from appliance.record import live
-from appliance.record.about import About
-from appliance.record.facts import LoggedMessage
-from appliance.record.live import NAME, LiveOptions, LiveView
+from appliance.record import foxglove_bridge
+from appliance.record.foxglove_bridge import NAME, LiveOptions, LiveView
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info
 from appliance.record.recorder import Recorder
+from appliance.record.segments import About
 from appliance.record.settings import RecordConfig
 
 pytestmark = pytest.mark.anyio
@@ -133,7 +133,7 @@ async def test_keys_without_end_cost_no_memory(
     sessions: tuple[Session, Session], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Channels are bounded, wanted or not: those that were silent for longest go, one that goes on speaking stays."""
-    monkeypatch.setattr(live, "MOST_CHANNELS", 20)
+    monkeypatch.setattr(foxglove_bridge, "MOST_CHANNELS", 20)
     speaker, viewer = sessions
     keys = speaker.keys
     for wanted in ((), (keys.log("g1"),)):

@@ -15,12 +15,12 @@ from appliance.plane.keys import Keys
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.ports import free_port
-from appliance.record.asking import replay, steer
 from appliance.record.edit import Select
-from appliance.record.facts import LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.player import Clock, Player, PlayOptions
+from appliance.record.remote_control import replay, steer
+from appliance.record.segments import LogWriter
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 pytestmark = pytest.mark.anyio
 LOGGED = Keys("then")

@@ -18,13 +18,13 @@ from appliance.errors import RecordError
 from appliance.model import GatewayStatus, Notice, encode
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.record.asking import trigger
 from appliance.record.edit import recover
-from appliance.record.facts import Gap, LoggedMessage, RecorderStatus
+from appliance.record.models import Gap, LoggedMessage, RecorderStatus
 from appliance.record.reader import info, read
 from appliance.record.recorder import Recorder, run_recorder
+from appliance.record.remote_control import trigger
+from appliance.record.segments import LogWriter
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 pytestmark = pytest.mark.anyio
 

@@ -14,11 +14,11 @@ import pytest
 
 from appliance.model import ContainerInfo, ContainerState, TaskRecord
 from appliance.plane.keys import Keys
-from appliance.record.facts import LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 from appliance.tasks.check import CheckReport, check
-from appliance.tui.hearing import Hearing
 from appliance.tui.store import Store
+from appliance.tui.subscriptions import Hearing
 
 LOGS = Path(__file__).parent / "logs" / "runs"
 LARGEST_BYTES = 300_000

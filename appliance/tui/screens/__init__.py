@@ -3,15 +3,13 @@
 Those of the fleet, the pool and the planner are here; tasks, robots, the log and replay have rooms of their own.
 """
 
-from appliance.tui.frame import FleetScreen
-from appliance.tui.logs.screen import LogScreen
-from appliance.tui.replay.screen import ReplayScreen
-from appliance.tui.robots.screen import RobotsScreen
-from appliance.tui.screens.fleet import FleetOverview
-from appliance.tui.screens.learning import LearningScreen
-from appliance.tui.screens.llm import LlmScreen
-from appliance.tui.screens.pool import PoolScreen
-from appliance.tui.tasks.screen import TasksScreen
+from appliance.tui.base_screen import FleetScreen
+from appliance.tui.screens.fleet import FleetOverview, PoolScreen
+from appliance.tui.screens.logs import LogScreen
+from appliance.tui.screens.models import LearningScreen, LlmScreen
+from appliance.tui.screens.replay import ReplayScreen
+from appliance.tui.screens.robots import RobotsScreen
+from appliance.tui.screens.tasks import TasksScreen
 
 SCREENS: dict[str, type[FleetScreen]] = {
     "fleet": FleetOverview,

@@ -10,10 +10,10 @@ from textual.pilot import Pilot
 from appliance.fleet_state import FleetState
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.data import FleetView
-from appliance.tui.grammar import Command
+from appliance.tui.command_line import Command
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Store
+from appliance.tui.subscriptions import FleetView
 
 KEYS = {" ": "space", "-": "minus", "/": "slash", "_": "underscore", ".": "full_stop", "?": "question_mark"}
 LONG_S = 60.0

@@ -12,8 +12,8 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
-from appliance.tui.dialogs import ConfirmDialog
-from appliance.tui.tasks.review import ReviewScreen
+from appliance.tui.screens.review import ReviewScreen
+from appliance.tui.widgets.dialogs import ConfirmDialog
 
 from .operating import LONG_S, Operator
 

@@ -35,8 +35,8 @@ from appliance.plane.settings import PlaneConfig
 from appliance.tasks.api import PlanAnswer, PlanAsk, TaskList, TasksAsk
 from appliance.tasks.steering.api import CancelTaskAsk
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.data import FleetView
 from appliance.tui.settings import TuiConfig
+from appliance.tui.subscriptions import FleetView
 
 pytestmark = pytest.mark.anyio
 

@@ -16,9 +16,9 @@ from appliance.model import (
     TaskRequest,
     TaskState,
 )
-from appliance.tui.dialogs import ConfirmDialog
-from appliance.tui.robots.takeover import TakeoverScreen
-from appliance.tui.tasks.review import ReviewScreen
+from appliance.tui.screens.review import ReviewScreen
+from appliance.tui.screens.takeover import TakeoverScreen
+from appliance.tui.widgets.dialogs import ConfirmDialog
 
 from .operating import Operator, does, operator
 from .ordering import ENDLESS, confirm, final, proposed, record_of, running, select

@@ -21,7 +21,7 @@ from appliance.model import (
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
-from appliance.tui.robots.takeover import TakeoverScreen
+from appliance.tui.screens.takeover import TakeoverScreen
 
 from .conftest import LAME
 from .operating import LONG_S, Operator, does

@@ -11,8 +11,8 @@ from appliance.client import FleetClient
 from appliance.fleet_state import FleetState
 from appliance.model import TaskRecord, TaskRequest, TaskState
 from appliance.record.reader import read
-from appliance.tui.dialogs import ConfirmDialog
-from appliance.tui.replay.source import ReplayView
+from appliance.tui.replay import ReplayView
+from appliance.tui.widgets.dialogs import ConfirmDialog
 
 from .operating import LONG_S, Operator, operator
 

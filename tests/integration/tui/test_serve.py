@@ -14,8 +14,7 @@ import pytest
 from fleets import INTERRUPTIBLE
 
 from appliance.errors import ConfigError
-from appliance.tui.serve.guard import Guard
-from appliance.tui.serve.server import SESSIONS, BrowserServer, listen
+from appliance.tui.serve import SESSIONS, BrowserServer, Guard, listen
 
 pytestmark = pytest.mark.anyio
 
@@ -186,7 +185,7 @@ async def test_what_is_no_message_does_no_harm(served: Served) -> None:
 
 async def test_sessions_are_bounded(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """When so many browsers have it open, the next one is told so."""
-    monkeypatch.setattr("appliance.tui.serve.server.SESSIONS", 0)
+    monkeypatch.setattr("appliance.tui.serve.SESSIONS", 0)
     status, text, _ = await served.get("/ws", **served.own)
     assert (status, SESSIONS) == (503, 8)
     assert "close one" in text

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import NotFoundError
-from appliance.record.budget import Kept, make_room, pin, pin_of, surplus
+from appliance.record.retention import Kept, make_room, pin, pin_of, surplus
 
 files = st.lists(
     st.builds(

@@ -10,9 +10,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from appliance.errors import ConfigError, RecordError
-from appliance.record.cat import cat, text_line
-from appliance.record.edit import EDITED, Select, copy, instant
-from appliance.record.facts import LoggedMessage
+from appliance.record.edit import EDITED, Select, cat, copy, instant, text_line
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 
 SECOND = 10**9

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.errors import ConfigError
-from appliance.record.expressions import check_expression, matches
+from appliance.record.models import check_expression, matches
 
 _CHUNK = st.sampled_from(["a", "b", "ab"])
 _KEY = st.lists(_CHUNK, min_size=1, max_size=5).map("/".join)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.plane.backlog import NUMBERS, UNKNOWN
-from appliance.record.facts import LoggedMessage
-from appliance.record.following import MOST_HELD, Follower, Hole
+from appliance.record.backfill import MOST_HELD, Follower, Hole
+from appliance.record.models import LoggedMessage
 
 
 def _message(number: int, source: str = "a/1") -> LoggedMessage:

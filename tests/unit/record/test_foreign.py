@@ -9,8 +9,7 @@ import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
 from appliance.errors import RecordError
-from appliance.record.cat import cat
-from appliance.record.edit import Select, copy
+from appliance.record.edit import Select, cat, copy
 from appliance.record.player import in_order, remapped
 from appliance.record.reader import info, read
 

@@ -7,15 +7,8 @@ import pytest
 
 from appliance.model import Pose, RobotInfo, Site, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import LoggedMessage
-from appliance.record.foxglove import (
-    FRAME_TRANSFORM,
-    LOCATION_FIX,
-    POSE_IN_FRAME,
-    SITE_FRAME,
-    Foxglove,
-    facing,
-)
+from appliance.record.models import LoggedMessage
+from appliance.record.schemas import FRAME_TRANSFORM, LOCATION_FIX, POSE_IN_FRAME, SITE_FRAME, Foxglove, facing
 
 KEYS = Keys("f1")
 SITE = Site(latitude_deg=47.0, longitude_deg=8.0, altitude_m=400.0)

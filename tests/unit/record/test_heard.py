@@ -1,8 +1,7 @@
 """What is told of a recorder that misses messages: how many, of which keys, at once."""
 
 from appliance.model import RecorderNote
-from appliance.record.facts import RecorderStatus
-from appliance.record.heard import FORGET_S, SILENT_S, Recorders, kinds_text, problem_of, together
+from appliance.record.models import FORGET_S, SILENT_S, Recorders, RecorderStatus, kinds_text, problem_of, together
 
 
 def _status(**fields: object) -> RecorderStatus:

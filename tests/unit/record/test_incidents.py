@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from appliance.model import Plan, RobotInfo, SoftStop, Subtask, TaskRecord, TaskState, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import Incident, LoggedMessage, Trigger
 from appliance.record.incidents import EACH, EVERY, Ring, Triggers
-from appliance.record.pipeline import Pipeline
+from appliance.record.models import Incident, LoggedMessage, Trigger
 from appliance.record.reader import info, read
+from appliance.record.recorder import Pipeline
+from appliance.record.segments import LogWriter
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 KEYS = Keys("f1")
 JSON = "application/json"

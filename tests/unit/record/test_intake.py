@@ -5,7 +5,7 @@ import threading
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.record.facts import LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.recorder import Drop, Intake
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from appliance.record.mcapfile import McapFile
+from appliance.record.mcap_writer import McapFile
 from appliance.record.reader import info, read
 
 messages = st.lists(st.tuples(st.integers(0, 4), st.integers(1, 2**62), st.binary(max_size=60)), max_size=60)

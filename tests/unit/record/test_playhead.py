@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import ConfigError
-from appliance.record.player import check_rate, parse_remap
-from appliance.record.playhead import FASTEST, SLOWEST, Playhead
+from appliance.record.player import FASTEST, SLOWEST, Playhead, check_rate, parse_remap
 
 SECOND = 10**9
 

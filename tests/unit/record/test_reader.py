@@ -15,14 +15,12 @@ from mcap.writer import CompressionType, IndexType, Writer
 from appliance.errors import NotFoundError, RecordError
 from appliance.model import LogLine, encode
 from appliance.plane.keys import Keys
-from appliance.record import records
-from appliance.record.cat import cat
-from appliance.record.edit import Select, recover
-from appliance.record.facts import LoggedMessage
-from appliance.record.openlog import Attached
+from appliance.record import reader
+from appliance.record.edit import Select, cat, recover
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
+from appliance.record.segments import Attached, LogWriter
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 MAGIC_BYTES = 8
 
@@ -136,7 +134,7 @@ def test_a_chunk_that_unpacks_to_the_memory(
     tmp_path: Path, compression: CompressionType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever it claims, a chunk is unpacked up to the limit, also one that the index says has gaps in it."""
-    monkeypatch.setattr(records, "CHUNK_LIMIT", 2**20)
+    monkeypatch.setattr(reader, "CHUNK_LIMIT", 2**20)
     out = io.BytesIO()
     writer = Writer(out, chunk_size=2**30, compression=compression)
     writer.start()

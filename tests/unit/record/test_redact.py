@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from appliance.model import encode
 from appliance.plane.keys import Keys
-from appliance.record.about import about
-from appliance.record.facts import LoggedMessage
-from appliance.record.pipeline import Pipeline
+from appliance.record.models import LoggedMessage
+from appliance.record.recorder import Pipeline
 from appliance.record.redact import REDACTED, Redactor, known_secrets, names_a_secret, without_secrets
+from appliance.record.segments import LogWriter, about
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 KEYS = Keys("f1")
 PLANTED = "hunter2-planted-9c1f"

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from appliance.errors import RecordError
 from appliance.record.edit import copy, recover
-from appliance.record.facts import LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 from tests.unit.record.test_edit import write
 from tests.unit.record.test_reader import MESSAGES, PACKED, PLAIN
@@ -192,9 +192,9 @@ _KILLED = """
 import sys, time
 from pathlib import Path
 from appliance.plane.keys import Keys
-from appliance.record.facts import LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
+from appliance.record.segments import LogWriter
 config = RecordConfig(directory=sys.argv[1], free_bytes=0, total_bytes=0, chunk_bytes=2000, flush_s=0.05)
 writer = LogWriter(config, fleet="f1")
 writer.prepare()

@@ -7,9 +7,8 @@ import pytest
 
 from appliance.model import LogLine, Notice, TaskRecord, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import LoggedMessage
-from appliance.record.foxglove import LOG_KIND, Foxglove
-from appliance.record.schemas import KeySchemas, flat_schema
+from appliance.record.models import LoggedMessage
+from appliance.record.schemas import LOG_KIND, Foxglove, KeySchemas, flat_schema
 
 KEYS = Keys("f1")
 SCHEMAS = KeySchemas(KEYS)

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from appliance.model import LogLine, RunEvent, RunEventKind, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import LoggedMessage
-from appliance.record.pipeline import Pipeline
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info
-from appliance.record.sequences import MOST_SOURCES, Sequences
+from appliance.record.recorder import MOST_SOURCES, Pipeline, Sequences
+from appliance.record.segments import LogWriter
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 KEYS = Keys("f1")
 

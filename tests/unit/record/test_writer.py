@@ -13,11 +13,11 @@ from mcap.reader import make_reader
 from appliance.errors import ConfigError, RecordError
 from appliance.model import LogLine, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import Gap, Incident, LoggedMessage
-from appliance.record.logfile import LogFile
+from appliance.record.mcap_writer import LogFile
+from appliance.record.models import Gap, Incident, LoggedMessage
 from appliance.record.reader import info, read
+from appliance.record.segments import MOST_MARKS, LogWriter, file_prefix
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import MOST_MARKS, LogWriter, file_prefix
 
 KEYS = Keys("f1")
 JSON = "application/json"

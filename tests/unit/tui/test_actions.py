@@ -19,16 +19,15 @@ from appliance.pool.transfer.api import Brought
 from appliance.robots.api import StopAnswer
 from appliance.tasks.migration.api import DrainState, Migrated
 from appliance.tasks.why import TaskWhy
-from appliance.tui import grammar, signs
-from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS
+from appliance.tui import command_line, status_styles
+from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS, keymap
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.dialogs import ConfirmDialog, TextDialog
-from appliance.tui.filter import Filter
-from appliance.tui.grid import Grid
-from appliance.tui.keys import keymap
-from appliance.tui.replay.source import ReplayView
+from appliance.tui.command_line import Filter
+from appliance.tui.replay import ReplayView
+from appliance.tui.screens.submit import SubmitDialog
 from appliance.tui.settings import TuiConfig
-from appliance.tui.tasks.submit import SubmitDialog
+from appliance.tui.widgets.dialogs import ConfirmDialog, TextDialog
+from appliance.tui.widgets.grid import Grid
 
 from .pictures import characters, settle
 
@@ -98,23 +97,23 @@ def test_each_action_that_changes_something_is_done_on_a_real_fleet(project_root
 
 def test_command_line_is_read() -> None:
     """Arguments stand in order; those not written come from what is selected; what nobody gave is missing."""
-    command = grammar.read("migrate t-1/s2 gw-2", {"gateway": "gw-9"})
+    command = command_line.read("migrate t-1/s2 gw-2", {"gateway": "gw-9"})
     assert (command.action.name, command.given) == ("migrate", {"subtask": "t-1/s2", "gateway": "gw-2"})
-    command = grammar.read("cancel", {"task": "t-1"})
+    command = command_line.read("cancel", {"task": "t-1"})
     assert command.given == {"task": "t-1"}
     assert not command.missing
-    assert [each.name for each in grammar.read("cancel", {}).missing] == ["task"]
-    assert grammar.read("sub  go  to 'the gate' ", {}).given == {"instruction": "go  to 'the gate'"}
-    assert grammar.read("stop", {"robot": "r1"}).given == {}, "a stop of the fleet is not narrowed by a selection"
-    assert grammar.read("resume-robots", {"robot": "r1"}).given == {"robot": "r1"}
+    assert [each.name for each in command_line.read("cancel", {}).missing] == ["task"]
+    assert command_line.read("sub  go  to 'the gate' ", {}).given == {"instruction": "go  to 'the gate'"}
+    assert command_line.read("stop", {"robot": "r1"}).given == {}, "a stop of the fleet is not narrowed by a selection"
+    assert command_line.read("resume-robots", {"robot": "r1"}).given == {"robot": "r1"}
     for line in ("", "fly away", "theme a b", "s"):
-        with pytest.raises(grammar.UsageError):
-            grammar.read(line, {})
+        with pytest.raises(command_line.UsageError):
+            command_line.read(line, {})
 
 
 def test_completion_knows_the_fleet(view: "FakeView") -> None:
     """Tab completes commands, then what their arguments may be by kind, what begins so first."""
-    complete = grammar.complete
+    complete = command_line.complete
     assert "drain " in complete("dr", view.store, {})
     assert complete("drain ", view.store, {}) == ("drain gw-a", "drain gw-b")
     assert complete("migrate t-running/s1 gw", view.store, {}) == (
@@ -132,9 +131,9 @@ def test_completion_knows_the_fleet(view: "FakeView") -> None:
 @given(line=st.text(max_size=60))
 def test_any_line_is_a_command_or_an_error(line: str) -> None:
     """Whatever is typed is a command or a usage error, and never has more words than were written."""
-    assert len(grammar.words(line)) <= len(line)
+    assert len(command_line.words(line)) <= len(line)
     with contextlib.suppress(SwiftbotError):
-        assert grammar.read(line, {}).action in ACTIONS
+        assert command_line.read(line, {}).action in ACTIONS
 
 
 def test_filter_is_an_expression() -> None:
@@ -163,7 +162,7 @@ def test_any_filter_answers(pattern: str, line: str) -> None:
 @given(state=st.text(max_size=100))
 def test_unknown_states_have_a_sign(state: str) -> None:
     """A state that this version does not know is shown by its name, with one cell for the glyph."""
-    for of in (signs.task, signs.subtask, signs.container, signs.level):
+    for of in (status_styles.task, status_styles.subtask, status_styles.container, status_styles.level):
         sign = of(state)
         assert len(sign.glyph) == 1
         assert sign.word

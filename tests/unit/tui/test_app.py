@@ -9,17 +9,15 @@ from msgspec.structs import replace
 
 from appliance.errors import PlanError, RefusedError, UnreachableError
 from appliance.model import LogLine, Notice, RunEvent, RunEventKind, TaskRecord, TaskState, encode
-from appliance.record.facts import RecorderStatus
+from appliance.record.models import RecorderStatus
 from appliance.tui.actions import ACTIONS
-from appliance.tui.app import SwiftbotApp
-from appliance.tui.dialogs import ConfirmDialog
-from appliance.tui.grid import Grid
-from appliance.tui.hearing import Hearing
-from appliance.tui.help import HelpDialog
-from appliance.tui.running import export_picture
+from appliance.tui.app import SwiftbotApp, export_picture
+from appliance.tui.screens.submit import SubmitDialog
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Connection
-from appliance.tui.tasks.submit import SubmitDialog
+from appliance.tui.subscriptions import Hearing
+from appliance.tui.widgets.dialogs import ConfirmDialog, HelpDialog
+from appliance.tui.widgets.grid import Grid
 
 from .pictures import characters, settle
 

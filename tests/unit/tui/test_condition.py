@@ -19,17 +19,17 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
-from appliance.record.facts import RecorderStatus
+from appliance.record.models import RecorderStatus
+from appliance.tui import robot_view as robots
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.grid import Column, widths
-from appliance.tui.robots import facts as robots
-from appliance.tui.robots import screen as robots_screen
-from appliance.tui.screens import fleet, llm, pool
-from appliance.tui.screens.condition import gateway_notes, gateway_state, notes_of, recorder_notes
+from appliance.tui.screens import fleet, models
+from appliance.tui.screens import robots as robots_screen
+from appliance.tui.screens import tasks as tasks_screen
+from appliance.tui.screens.fleet import gateway_notes, gateway_state, notes_of, recorder_notes
+from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.store import Gateway
-from appliance.tui.tasks import screen as tasks_screen
-from appliance.tui.tasks.facts import reason
-from appliance.tui.tasks.review import ReviewScreen
+from appliance.tui.task_view import reason
+from appliance.tui.widgets.grid import Column, widths
 
 from .conftest import PLAN
 from .pictures import settle
@@ -49,8 +49,8 @@ ROOM = 80 - 2 - 1
         (fleet.GATEWAYS, "gateway state load cpu mem pool runs tasks link arc version"),
         (tasks_screen.TASKS, "task state done % at by instruction"),
         (robots_screen.ROBOTS, "robot kind, link mode batt x y z mission state"),
-        (pool.CONTAINERS, "image container gateway state age hits cpu/mem running now"),
-        (llm.GATEWAYS, "gateway slot queue tok/s plans escal. share of tiers asked"),
+        (fleet.CONTAINERS, "image container gateway state age hits cpu/mem running now"),
+        (models.GATEWAYS, "gateway slot queue tok/s plans escal. share of tiers asked"),
     ],
     ids=["fleet", "tasks", "robots", "pool", "llm"],
 )

@@ -5,9 +5,7 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 
 from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState
-from appliance.tui import drawing
-from appliance.tui.plans import shape
-from appliance.tui.tasks import facts
+from appliance.tui import formatting, plan_editor, task_view
 
 
 @st.composite
@@ -29,7 +27,7 @@ def plans(draw: st.DrawFn) -> Plan:
 @given(text=st.text(st.sampled_from("ab 漢é·"), max_size=120), margin=st.integers(0, 8), width=st.integers(0, 60))
 def test_what_takes_several_lines_hangs_below_its_first(text: str, margin: int, width: int) -> None:
     """Every line has the margin, the words are those of the text, and only a word longer than a line is too long."""
-    lines = drawing.hanging(text, " " * margin, width).split("\n")
+    lines = formatting.hanging(text, " " * margin, width).split("\n")
     assert all(line.startswith(" " * margin) for line in lines)
     assert " ".join(line[margin:] for line in lines).split() == text.split()
     if width > margin + 20:
@@ -40,8 +38,8 @@ def test_what_takes_several_lines_hangs_below_its_first(text: str, margin: int, 
 @given(plan=plans())
 def test_every_subtask_once_and_below_its_predecessors(plan: Plan) -> None:
     """The drawing has each subtask once, below all those it comes after, and deeper than them."""
-    order = shape.ordered(plan.subtasks)
-    depth = shape.depths(plan.subtasks)
+    order = plan_editor.ordered(plan.subtasks)
+    depth = plan_editor.depths(plan.subtasks)
     assert sorted(order) == sorted(each.id for each in plan.subtasks)
     for each in plan.subtasks:
         for parent in each.after:
@@ -55,14 +53,14 @@ def test_cycle_is_drawn_all_the_same() -> None:
     plan = Plan(
         domain="d", subtasks=(Subtask(id="a", skill="x", after=("b",)), Subtask(id="b", skill="y", after=("a",)))
     )
-    assert facts.plan_lines(plan.subtasks).plain.count("└─▶") >= 1
+    assert task_view.plan_lines(plan.subtasks).plain.count("└─▶") >= 1
 
 
 @settings(deadline=None)
 @given(fraction=st.floats(allow_nan=False))
 def test_bar_has_its_width(fraction: float) -> None:
     """A progress bar is as wide as it should be for any number that a skill reports."""
-    drawn, _, percent = drawing.bar(fraction, 10).partition(" ")
+    drawn, _, percent = formatting.bar(fraction, 10).partition(" ")
     assert len(drawn) == 10
     assert 0 <= int(percent.rstrip("%")) <= 100
 
@@ -74,6 +72,6 @@ def test_results_are_told_briefly() -> None:
         state=SubtaskState.SUCCEEDED,
         result={"image": {"artifact": "ab", "name": "door.png"}, "found": [1, 2], "text": "x" * 500},
     )
-    text = facts.subtask_lines(record, 0).plain
+    text = task_view.subtask_lines(record, 0).plain
     assert "image=door.png found: 2" in text
     assert len(text) < 250

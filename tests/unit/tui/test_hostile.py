@@ -28,14 +28,14 @@ from appliance.model import (
 )
 from appliance.model.planner import PlannerStatus, SlotStatus, TierFigures
 from appliance.pool.api import PoolDecision
-from appliance.record.facts import RecorderStatus
-from appliance.tui import dialogs
+from appliance.record.models import RecorderStatus
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.grid import Column, fit, widths
-from appliance.tui.hearing import Hearing
-from appliance.tui.screens import condition, fleet, gateway, llm, pool
+from appliance.tui.screens import fleet, models
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Gateway, Start, Store
+from appliance.tui.subscriptions import Hearing
+from appliance.tui.widgets import dialogs
+from appliance.tui.widgets.grid import Column, fit, widths
 
 if TYPE_CHECKING:
     from .conftest import FakeView
@@ -94,16 +94,16 @@ def test_rows_are_harmless(text: str, number: float) -> None:
     decision = ("g", PoolDecision(at_ns=status.started_ns, what=text, image=text, container=text, why=text))
     parts = [
         fleet.gateway_cells(each),
-        *condition.gateway_notes([each]),
-        *condition.recorder_notes([RecorderStatus(id=text, fleet="f", state=text, problem=text, dropped={text: 1})]),
-        gateway.about(each, store),
-        llm.model_cells(each),
-        llm.about(each),
-        llm.confidences([Plan(domain=text, subtasks=(), confidence=float(number))]),
-        pool.pool_cells(container),
-        pool.container_cells(container),
-        pool.starts_text([Start(None, float(number))], 80),
-        *pool.decision_lines([decision], 3),
+        *fleet.gateway_notes([each]),
+        *fleet.recorder_notes([RecorderStatus(id=text, fleet="f", state=text, problem=text, dropped={text: 1})]),
+        fleet.about(each, store),
+        models.model_cells(each),
+        models.about(each),
+        models.confidences([Plan(domain=text, subtasks=(), confidence=float(number))]),
+        fleet.pool_cells(container),
+        fleet.container_cells(container),
+        fleet.starts_text([Start(None, float(number))], 80),
+        *fleet.decision_lines([decision], 3),
     ]
     for part in parts:
         assert harmless(shown(part))

@@ -6,13 +6,11 @@ import pytest
 from textual.command import CommandPalette
 
 from appliance.errors import ConfigError
-from appliance.tui.actions import SCREENS
+from appliance.tui.actions import DIALOG_KEYS, SCREENS, keymap, names
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.keys import DIALOG_KEYS, keymap, names
-from appliance.tui.prompt import PromptInput
+from appliance.tui.screens.submit import SubmitDialog
 from appliance.tui.settings import TuiConfig
-from appliance.tui.tasks.submit import SubmitDialog
-from appliance.tui.widgets import Field
+from appliance.tui.widgets import Field, PromptInput
 
 from .pictures import characters, settle
 

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from appliance import cli
-from appliance.tui import running
-from appliance.tui.serve import running as serving
-from appliance.tui.serve.running import session_command
+from appliance.tui import app
+from appliance.tui import serve as serving
+from appliance.tui.serve import session_command
 
 CONNECT = ("--fleet", "yard", "--connect", "tcp/127.0.0.1:1")
 
@@ -26,7 +26,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., lis
     async def serve(fleet: str, connect: Any, *, options: list[str], **_: object) -> None:
         calls.append((fleet, connect, options))
 
-    monkeypatch.setattr(running, "run_tui", run_tui)
+    monkeypatch.setattr(app, "run_tui", run_tui)
     monkeypatch.setattr(serving, "serve", serve)
 
     def run(*arguments: str) -> list[tuple[Any, ...]]:

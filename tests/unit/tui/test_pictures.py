@@ -11,8 +11,8 @@ from appliance.model import PlannerStatus, RunEvent, RunEventKind, SlotStatus, T
 from appliance.model.placement import Phase
 from appliance.model.planner import CacheFigures, UpstreamStatus
 from appliance.pool.api import DecisionList, PoolDecision
-from appliance.record.facts import RecorderStatus
-from appliance.tui import drawing, themes
+from appliance.record.models import RecorderStatus
+from appliance.tui import formatting, themes
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.settings import TuiConfig
 
@@ -37,7 +37,7 @@ SCREENS = {
 @pytest.fixture
 def fleet(view: "FakeView", monkeypatch: pytest.MonkeyPatch) -> Iterator["FakeView"]:
     """Return a fleet in which much is the case at once, at one moment of universal time."""
-    monkeypatch.setattr(drawing, "time", SimpleNamespace(time_ns=lambda: NOW_NS))
+    monkeypatch.setattr(formatting, "time", SimpleNamespace(time_ns=lambda: NOW_NS))
     planner = PlannerStatus(
         tiers={"local": TierFigures(asked=40, failed=3, p50_ms=240.0), "rules": TierFigures(asked=10, p50_ms=2.0)},
         slot=SlotStatus(model="plan-en", state="ready", tokens_s=812.0, queue=1, queue_most=8, memory_mb=96.0),

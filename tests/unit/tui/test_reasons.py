@@ -11,7 +11,7 @@ from appliance.pool.api import Evicted, Released, Warmed
 from appliance.pool.transfer.api import Brought
 from appliance.robots.api import StopAnswer
 from appliance.tasks.migration.api import DrainState, Migrated
-from appliance.tui import grammar
+from appliance.tui import command_line
 from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS
 
 from .conftest import RUNNING
@@ -49,7 +49,7 @@ WITH_WHY = [
 async def test_why_goes_along_with_an_order(view: "FakeView", line: str, verb: str, answer: object) -> None:
     """What follows on the line is why, for the audit, whatever is ordered; a question shows it before the yes."""
     view.orders.answers[verb] = answer
-    command = grammar.read(line, {})
+    command = command_line.read(line, {})
     assert command.given["why"] == "a visitor"
     if command.action.dangerous:
         assert command.action.sentence(command.given).endswith("Why: a visitor")
@@ -69,7 +69,7 @@ def test_orders_that_change_something_take_why() -> None:
 async def test_a_name_written_wrongly_does_not_stop_nobody(view: "FakeView") -> None:
     """`:stop` with words that name no robot stops them all, and the words are why."""
     view.orders.answers["stop"] = StopAnswer(stops=())
-    command = grammar.read("stop rovr-1 is too fast", {})
+    command = command_line.read("stop rovr-1 is too fast", {})
     assert command.action.do is not None
     told = await command.action.do(cast("FleetClient", view.orders), command.given, "ann")
     assert "soft stop of the fleet" in str(told)

@@ -13,10 +13,10 @@ from appliance.model import Decision, Plan, Proposal, Subtask, TaskRecord, TaskS
 from appliance.tasks.steering.api import PlanChecked
 from appliance.tasks.watch.lines import Line, LineKind
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.grid import Grid
+from appliance.tui.screens.review import ReviewScreen
+from appliance.tui.screens.tasks import TaskScreen
 from appliance.tui.settings import TuiConfig
-from appliance.tui.tasks.graph import TaskScreen
-from appliance.tui.tasks.review import ReviewScreen
+from appliance.tui.widgets.grid import Grid
 
 if TYPE_CHECKING:
     from .conftest import FakeView

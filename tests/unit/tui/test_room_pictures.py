@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from appliance.model import Enquiry, Notice, Pose, RobotInfo, SoftStop
 from appliance.tasks.steering.api import PlanChecked
 from appliance.tasks.watch.lines import Line, LineKind
-from appliance.tui.replay import screen as replay_screen
-from appliance.tui.replay.files import LogFile
+from appliance.tui.replay import LogFile
+from appliance.tui.screens import replay as replay_screen
 
 from .pictures import NOW_NS, OTHER_SIZES, SIZES, compare_screen, never_refused, universal_time
 from .test_review import WAITING

@@ -4,9 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import GatewayStatus, RunEvent, RunEventKind, TaskRecord, TaskState
-from appliance.record.facts import RecorderStatus
-from appliance.tui.shelf import Shelf
-from appliance.tui.store import Connection, Store
+from appliance.record.models import RecorderStatus
+from appliance.tui.store import Connection, Shelf, Store
 
 
 def test_store_keeps_the_later_record() -> None:

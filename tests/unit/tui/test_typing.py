@@ -9,9 +9,9 @@ from textual.widgets import Input
 
 from appliance.tui.actions import SCREENS
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.dialogs import ConfirmDialog
+from appliance.tui.screens.submit import SubmitDialog
 from appliance.tui.settings import TuiConfig
-from appliance.tui.tasks.submit import SubmitDialog
+from appliance.tui.widgets.dialogs import ConfirmDialog
 
 if TYPE_CHECKING:
     from .conftest import FakeView

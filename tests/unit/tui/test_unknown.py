@@ -20,8 +20,8 @@ from appliance.model import (
 )
 from appliance.model.open_enum import enums_open
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.hearing import Hearing
 from appliance.tui.settings import TuiConfig
+from appliance.tui.subscriptions import Hearing
 
 from .pictures import characters
 

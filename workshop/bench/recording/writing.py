@@ -16,10 +16,10 @@ from mcap.writer import Writer
 
 from appliance.model import Pose, RobotInfo, encode
 from appliance.plane.keys import Keys
-from appliance.record.facts import LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
+from appliance.record.segments import LogWriter
 from appliance.record.settings import RecordConfig
-from appliance.record.writer import LogWriter
 
 _KEYS = 50
 _TICK_EVERY = 64

@@ -8,9 +8,9 @@ from textual.app import ComposeResult
 from textual.widgets import DataTable
 
 from appliance.model import TaskRecord
-from appliance.tui import signs
+from appliance.tui import status_styles
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.frame import FleetScreen
+from appliance.tui.base_screen import FleetScreen
 from appliance.tui.safe import safe
 from appliance.tui.screens import SCREENS
 from appliance.tui.store import Store
@@ -19,7 +19,7 @@ TITLES = ("task", "state", "first step", "instruction")
 
 
 def _cells(record: TaskRecord) -> tuple[Text, ...]:
-    sign = signs.task(record.state)
+    sign = status_styles.task(record.state)
     first = record.subtasks[0] if record.subtasks else None
     step = f"{first.progress:.0%} {safe(first.note, 40)}" if first is not None else ""
     return Text(safe(record.id, 63), "bold"), Text(sign.text, sign.style), Text(step), Text(safe(record.instruction))

@@ -23,9 +23,9 @@ from textual.drivers.headless_driver import HeadlessDriver
 from appliance.collector import gentle_collector
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.data import FleetView
-from appliance.tui.grid import Grid
 from appliance.tui.settings import TuiConfig
+from appliance.tui.subscriptions import FleetView
+from appliance.tui.widgets.grid import Grid
 from workshop.bench.figures import finite, quantile, summary
 from workshop.bench.tui.plain import PlainApp
 

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import PayloadError
-from appliance.tui.filter import Filter
-from appliance.tui.logs.lines import Heard, heard, line_text, plain, said
-from appliance.tui.logs.listening import expression_of
-from appliance.tui.logs.tail import Tail
+from appliance.tui.command_line import Filter
+from appliance.tui.formatting import Heard, heard, line_text, plain, said
+from appliance.tui.screens.logs import expression_of
+from appliance.tui.widgets.log_view import Tail
 
 
 def put(tail: Tail[Heard], *texts: str) -> None:

@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 
 from appliance.errors import PayloadError
 from appliance.model import Plan, Subtask
-from appliance.tui.plans import shape
-from appliance.tui.plans.difference import ChangeKind, difference, difference_text
-from appliance.tui.plans.editing import Draft, params_of, params_text
+from appliance.tui import plan_editor
+from appliance.tui.plan_editor import ChangeKind, Draft, difference, difference_text, params_of, params_text
 
 PLAN = Plan(
     domain="inspection",
@@ -113,8 +112,8 @@ def test_neighbours_change_places() -> None:
         ),
     )
     up = Draft.of(plan).moved("b", -1)
-    assert shape.ordered(up.subtasks) == ["b", "a", "c"]
-    assert shape.ordered(up.moved("b", 1).subtasks) == ["a", "b", "c"]
+    assert plan_editor.ordered(up.subtasks) == ["b", "a", "c"]
+    assert plan_editor.ordered(up.moved("b", 1).subtasks) == ["a", "b", "c"]
     with pytest.raises(PayloadError):
         Draft.of(plan).moved("a", -1)
 
@@ -130,7 +129,7 @@ def test_no_edit_makes_a_circle_or_loses_an_order(plan: Plan, data: st.DataObjec
         swapped = Draft.of(plan).moved(gone, data.draw(st.sampled_from([-1, 1])))
     except PayloadError:
         return
-    assert not shape.cycle(swapped.subtasks)
+    assert not plan_editor.cycle(swapped.subtasks)
     assert sorted(swapped.ids) == sorted(each.id for each in plan.subtasks)
 
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Subtask
-from appliance.tui.plans import shape
+from appliance.tui import plan_editor
 
 
 @st.composite
@@ -20,9 +20,9 @@ def graphs(draw: st.DrawFn) -> tuple[Subtask, ...]:
 @given(subtasks=graphs())
 def test_every_graph_is_laid_out(subtasks: tuple[Subtask, ...]) -> None:
     """Each id stands once and has a depth, whatever the graph; without a cycle below and deeper than what is before."""
-    order, depth = shape.ordered(subtasks), shape.depths(subtasks)
+    order, depth = plan_editor.ordered(subtasks), plan_editor.depths(subtasks)
     assert sorted(order) == sorted(depth) == sorted({each.id for each in subtasks})
-    if shape.cycle(subtasks):
+    if plan_editor.cycle(subtasks):
         return
     first = {each.id: each for each in reversed(subtasks)}
     for each in first.values():
@@ -35,5 +35,5 @@ def test_every_graph_is_laid_out(subtasks: tuple[Subtask, ...]) -> None:
 def test_long_chain_needs_no_recursion() -> None:
     """A chain longer than Python's stack is laid out as well."""
     chain = [Subtask(id=f"s{each}", skill="x", after=(f"s{each - 1}",) if each else ()) for each in range(3000)]
-    assert shape.ordered(chain)[-1] == "s2999"
-    assert len(shape.branch(2999)) < 40
+    assert plan_editor.ordered(chain)[-1] == "s2999"
+    assert len(plan_editor.branch(2999)) < 40

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.tui.plans.completing import common, completions
-from appliance.tui.plans.history import MOST, History
+from appliance.tui.screens.submit import MOST, History, common, completions
 
 NAMES = ("rover_1", "rover_2", "drone_1", "dock 1", "dock 3", "cold store", "charger")
 

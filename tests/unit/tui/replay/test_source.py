@@ -13,11 +13,10 @@ from appliance.errors import NotFoundError, RecordError, RefusedError
 from appliance.model import TaskRecord
 from appliance.record.reader import read
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.hearing import Hearing
-from appliance.tui.replay.cursor import Cursor
-from appliance.tui.replay.source import ReplayView, skipped, streamed
+from appliance.tui.replay import Cursor, ReplayView, skipped, streamed
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Store
+from appliance.tui.subscriptions import Hearing
 
 pytestmark = pytest.mark.anyio
 

@@ -3,7 +3,7 @@
 import pytest
 
 from appliance.errors import PayloadError
-from appliance.tui.replay.times import RATES, faster, rate_of, seconds_of, slower, told
+from appliance.tui.replay import RATES, faster, rate_of, seconds_of, slower, told
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "1e9", "nan", "", "fast"])

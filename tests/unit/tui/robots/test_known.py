@@ -16,8 +16,7 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
-from appliance.tui.robots.facts import Robot, leases_of, missions, questions_of
-from appliance.tui.robots.known import KnownRobots
+from appliance.tui.robot_view import KnownRobots, Robot, leases_of, missions, questions_of
 from appliance.tui.store import Gateway, Store
 
 NAMES = ("r1", "r2", "r3")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from appliance.tui.robots.map import TOO_WIDE, Area, Spot, draw, scale_of, view_of
+from appliance.tui.widgets.map import TOO_WIDE, Area, Spot, draw, scale_of, view_of
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-100, 100)
 SPOTS = st.builds(

@@ -9,7 +9,7 @@ from textual.pilot import Pilot
 from appliance.errors import ConflictError, RefusedError, SwiftbotError
 from appliance.model import Lease, RobotInfo, RobotReply
 from appliance.tui.app import SwiftbotApp
-from appliance.tui.robots.takeover import TakeoverScreen
+from appliance.tui.screens.takeover import TakeoverScreen
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Connection, Store
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Pose, RobotInfo
-from appliance.tui.robots.trails import MOST_SHOWN, MOST_TRAILS, TRAIL, Trails, shown_of
+from appliance.tui.robot_view import MOST_SHOWN, MOST_TRAILS, TRAIL, Trails, shown_of
 
 
 @given(at=st.lists(st.integers(0, 3), max_size=200), most=st.integers(1, 80))

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import ConfigError
-from appliance.tui.serve.guard import Guard, make_token
-from appliance.tui.serve.page import SCRIPT, page
+from appliance.tui.serve import SCRIPT, Guard, make_token, page
 
 TOKEN = "a-good-token-of-length"  # noqa: S105 - of this test alone
 PLAIN = {"Host": "127.0.0.1:8000"}

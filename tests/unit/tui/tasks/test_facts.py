@@ -5,8 +5,17 @@ from hypothesis import strategies as st
 
 from appliance.model import Failure, Plan, Proposal, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
 from appliance.tasks.why import CandidateWhy, SubtaskWhy, Waits
-from appliance.tui.tasks.facts import brief, nodes, progress, reason, subtask_cells, task_cells, task_text, whole
-from appliance.tui.tasks.reasons import subtask_text
+from appliance.tui.task_view import (
+    brief,
+    nodes,
+    progress,
+    reason,
+    subtask_cells,
+    subtask_text,
+    task_cells,
+    task_text,
+    whole,
+)
 
 HOSTILE = st.text(max_size=40) | st.sampled_from(
     ["\x1b[2J\x1b]0;x\x07", "[bold red]x[/]", "\u202egnp.exe", "\u0300" * 50, "家" * 50, "שלום", "\x00\x7f", "a\nb\tc"]

@@ -1,0 +1,242 @@
+"""The running fleet in Foxglove: what the recorder would write is served live, on the same channels.
+
+Foxglove connects to a WebSocket server (its protocol is `foxglove.sdk.v1`; the server is the `foxglove-sdk` package, an
+optional extra). Channels, schemas and derived messages are those of a log, by the same code, and secrets are taken out
+as they are there. A slow client loses its oldest messages (the SDK's bounded backlog); the fleet never waits for it.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import ConfigError, PrerequisiteError
+from appliance.plane.session import Closer, Session
+from appliance.plane.settings import PlaneConfig
+from appliance.record.models import LoggedMessage, check_expression, compile_expression
+from appliance.record.redact import Redactor
+from appliance.record.schemas import ChannelKind, Derive, Foxglove, KeySchemas
+from appliance.record.segments import JSON, LAST_NS, About
+
+log = structlog.get_logger(__name__)
+
+PORT = 8765
+"""Foxglove's own default."""
+NAME = "live"
+"""In the place of a recorder's name, in the keys of derived messages."""
+MOST_CHANNELS = 10_000
+"""Beyond, the channel that was silent for longest is closed: each task has some of its own. Keys that nobody wants
+count as well."""
+BACKLOG = 1024
+"""Messages that wait for one client; the oldest are dropped."""
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+class LiveOptions(Struct, frozen=True, kw_only=True):
+    """Where the server listens."""
+
+    host: str = "127.0.0.1"
+    """Loopback: Foxglove's protocol knows no password. From elsewhere: an SSH tunnel."""
+    port: int = PORT
+    """0: any that is free."""
+    keys: tuple[str, ...] = ()
+    """Key expressions; only keys that one of them includes. None: all."""
+
+    def check(self) -> None:
+        """Raise ConfigError for what cannot be."""
+        if self.host not in LOOPBACK:
+            raise ConfigError(
+                f"--host {self.host[:60]!r}: whoever connects sees everything, without a password",
+                remedy="listen on 127.0.0.1, and reach it through `ssh -L 8765:127.0.0.1:8765`",
+            )
+        for each in self.keys:
+            check_expression(each)
+        if not 0 <= self.port <= 65535:
+            raise ConfigError(f"--port {self.port}", remedy="give 0 (any) to 65535")
+
+
+class _Channel:
+    """A channel of the server, and what is made of its messages."""
+
+    def __init__(self, base: Any, derive: Derive | None) -> None:
+        self.base = base
+        self.derive = derive
+
+
+class LiveView:
+    """Serves one fleet's messages.
+
+    Args:
+        session: on the fleet's plane.
+        options: where it listens.
+        about: site and secrets, as a recorder has them.
+
+    Raises:
+        PrerequisiteError: foxglove-sdk is not installed.
+        ConfigError: the port cannot be listened on.
+    """
+
+    def __init__(self, session: Session, options: LiveOptions, *, about: About | None = None) -> None:
+        options.check()
+        about = about or About()
+        self._session = session
+        self._foxglove = _sdk()
+        self._context = self._foxglove.Context()
+        self._schemas = KeySchemas(session.keys)
+        self._views = Foxglove(session.keys, NAME, site=about.site)
+        self._redactor = Redactor(about.secrets)
+        keys = session.keys
+        self._raw = tuple(map(compile_expression, (keys.mavlink(), keys.link_frames(), keys.camera())))
+        self._wanted = [compile_expression(each) for each in options.keys]
+        self._channels: OrderedDict[tuple[str, str], _Channel | None] = OrderedDict()
+        """By key and encoding, the one that was silent for longest first; None: not wanted."""
+        self._subscription: Closer | None = None
+        self.messages = 0
+        try:
+            self._server: Any = self._foxglove.start_server(
+                name=f"SwiftBot {session.keys.fleet}",
+                host=options.host,
+                port=options.port,
+                context=self._context,
+                message_backlog_size=BACKLOG,
+                supported_encodings=["json"],
+            )
+        except (RuntimeError, OSError, ValueError) as error:
+            raise ConfigError(
+                f"the live view cannot listen on {options.host}:{options.port}: {error}", remedy="choose another --port"
+            ) from error
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        return int(self._server.port)
+
+    @property
+    def channels(self) -> int:
+        """Channels offered."""
+        return sum(each is not None for each in self._channels.values())
+
+    def start(self) -> None:
+        """Begin to hear the fleet. Blocks shortly."""
+        self._subscription = self._session.flood(self._session.keys.everything(), LoggedMessage, self._take)
+
+    def stop(self) -> None:
+        """Hear no more, and let the clients go. Blocks shortly."""
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None
+        self._server.stop()
+
+    def _take(self, messages: list[LoggedMessage]) -> None:
+        for message in messages:
+            self._show(message)
+
+    def _show(self, message: LoggedMessage) -> None:
+        if message.deleted:
+            return
+        which = (message.key, message.encoding)
+        if which in self._channels:
+            channel = self._channels[which]
+            self._channels.move_to_end(which)
+        else:
+            channel = self._open(which)
+        if channel is None:
+            return
+        at_ns = message.at_ns if 0 < message.at_ns <= LAST_NS else time.time_ns()
+        if channel.base.has_sinks() or channel.derive is not None:
+            raw = any(each.fullmatch(message.key) for each in self._raw)
+            clean = self._redactor.text(message.payload) if raw else self._redactor.json(message.payload)
+            if clean is not message.payload:
+                message = LoggedMessage(message.key, message.at_ns, clean, message.encoding)
+            channel.base.log(clean, log_time=at_ns)
+            self.messages += 1
+            for made in channel.derive(message) if channel.derive else ():
+                topic = (made.topic, JSON)
+                other = self._channels.get(topic) or self._made(topic, made.kind, None)
+                self._channels.move_to_end(topic)
+                other.base.log(made.payload, log_time=at_ns)
+
+    def _open(self, which: tuple[str, str]) -> _Channel | None:
+        key, encoding = which
+        if self._wanted and not any(each.fullmatch(key) for each in self._wanted):
+            self._make_room()
+            self._channels[which] = None
+            return None
+        return self._made(which, self._schemas.kind_of(key, encoding), self._views.deriving(key))
+
+    def _make_room(self) -> None:
+        while len(self._channels) >= MOST_CHANNELS:
+            _, silent = self._channels.popitem(last=False)
+            if silent is not None:
+                silent.base.close()
+
+    def _made(self, which: tuple[str, str], kind: ChannelKind, derive: Derive | None) -> _Channel:
+        self._make_room()
+        encoding = "jsonschema" if kind.schema else ""
+        schema = self._foxglove.Schema(name=kind.schema, encoding=encoding, data=kind.schema_text)
+        base = self._foxglove.Channel(
+            which[0],
+            schema=schema,
+            message_encoding=kind.encoding,
+            context=self._context,
+            metadata={"encoding": which[1], **dict(kind.metadata)},
+        )
+        channel = self._channels[which] = _Channel(base, derive)
+        return channel
+
+
+def _sdk() -> Any:
+    try:
+        import foxglove  # noqa: PLC0415 - an optional extra, and 19 MB
+    except ImportError as error:
+        raise PrerequisiteError(
+            "the live view needs the package foxglove-sdk",
+            remedy="install the extra `foxglove`, as pinned in locks/foxglove.txt",
+        ) from error
+    return foxglove
+
+
+async def serve(
+    options: LiveOptions,
+    plane: PlaneConfig,
+    fleet: str,
+    stop: asyncio.Event,
+    *,
+    about: About | None = None,
+    told: Callable[[LiveView], None] = lambda _view: None,
+) -> int:
+    """Serve the live view until `stop` is set; returns how many messages were shown.
+
+    Args:
+        options: where it listens.
+        plane: how to reach the fleet.
+        fleet: its name.
+        stop: ends it.
+        about: site and secrets.
+        told: called with the view when it listens, and then every second.
+
+    Raises:
+        PrerequisiteError, ConfigError: as `LiveView`.
+        UnreachableError: the network could not be joined.
+    """
+    session = await Session.open(plane, fleet)
+    try:
+        view = LiveView(session, options, about=about)
+        await asyncio.to_thread(view.start)
+        log.info("live view", address=f"ws://{options.host}:{view.port}", fleet=fleet)
+        try:
+            while not stop.is_set():
+                told(view)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(1.0):
+                        await stop.wait()
+        finally:
+            await asyncio.to_thread(view.stop)
+        return view.messages
+    finally:
+        await session.close()

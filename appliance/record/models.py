@@ -1,0 +1,277 @@
+"""What a log tells: a message, a gap, a deletion, an incident, and the status of files and recorders.
+
+Writer, reader, CLI and terminal UI share these structs, and the matching of keys against Zenoh's key expressions, which
+is done here without a Zenoh session, since logs are read where no network is: `*` is one chunk, `**` any number of
+chunks (none too), `$*` any text within a chunk. `Recorders` sums up what the fleet's recorders last said, for a
+gateway's own status and for diagnosis. No I/O.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+
+from msgspec import Struct, field
+
+from appliance.errors import ConfigError
+from appliance.model import RecorderNote
+
+
+class LoggedMessage(Struct, frozen=True):
+    """One put (or delete, when `deleted`) on a key. `at_ns` is Zenoh's timestamp, or the arrival's without one.
+
+    `encoding` is Zenoh's (`application/json`, ...). `source` and `number` are the Zenoh session that put it and its
+    number there (`plane.backlog`), where the sender gives it one; they are not kept in a log.
+    """
+
+    key: str
+    at_ns: int
+    payload: bytes
+    encoding: str = ""
+    deleted: bool = False
+    source: str = ""
+    number: int = 0
+
+
+class Gap(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Messages that are not in the log, and why: what was dropped is itself written down."""
+
+    reason: str
+    """`queue full`, `disk full`, `too large` or `write error`: dropped here. `not heard`: numbers that a speaker left
+    out, or that were lost on the way here (see `source`)."""
+    dropped: int
+    payload_bytes: int = 0
+    since_ns: int = 0
+    until_ns: int = 0
+    last_key: str = ""
+    """Key of the last message dropped, as a hint."""
+    source: str = ""
+    """Of what was not heard: whose numbers have a hole. `plane`: of a session of the fleet; `mavlink`: frames of a
+    vehicle that no gateway received, lost on its link or while its gateway was down; `log`, `run` and `transition`: of
+    senders whose sessions give no numbers."""
+    keys: dict[str, int] = {}
+    """The same count by kind of key, such as `gw/*/log`."""
+
+
+class Deletion(Struct, frozen=True, kw_only=True):
+    """A key that was deleted: a delete carries no payload, so it cannot stand on its key's own channel."""
+
+    key: str
+    at_ns: int
+
+
+class Trigger(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Somebody, or something, says that what has just happened is worth keeping."""
+
+    reason: str
+    by: str = ""
+
+
+class Incident(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What made the recorder keep what it has, in the log at the place where it happened."""
+
+    reason: str
+    """`task failed`, `failsafe`, `stop` or `asked`."""
+    detail: str = ""
+    key: str = ""
+    """Of the message that told it."""
+    at_ns: int = 0
+    before_s: float = 0.0
+    """How far back the log goes from here, where it had waited in the ring."""
+
+
+class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A recorder's account of itself, put every second."""
+
+    id: str
+    fleet: str
+    state: str = "starting"
+    """`recording`, `waiting` (for an incident), `paused` (see `problem`), `failed` or `stopped`."""
+    problem: str = ""
+    file: str = ""
+    """File name within the recorder's directory."""
+    files: int = 0
+    messages: int = 0
+    file_bytes: int = 0
+    queued: int = 0
+    dropped: dict[str, int] = field(default_factory=dict[str, int])
+    """Messages not recorded, by reason."""
+    not_heard: dict[str, int] = field(default_factory=dict[str, int])
+    """Messages that never came here, by whose numbers they are missing from."""
+    fetched: int = 0
+    """Messages that did not reach it when they were put, and were fetched from their senders afterwards."""
+    missed: dict[str, int] = field(default_factory=dict[str, int])
+    """Messages of the fleet that are not in its log, dropped or not heard, by kind of key, such as `gw/*/log`."""
+    missed_at_ns: int = 0
+    """Time of the last of them; 0: none is missing."""
+    redacted: int = 0
+    """Messages from which a secret was taken."""
+    incidents: int = 0
+    last_incident: str = ""
+    unwritten_incidents: int = 0
+    """Of them, those that wait in memory until there is room on the disk."""
+    held: int = 0
+    """Messages that wait in the ring for an incident."""
+    removed: int = 0
+    """Old files removed to stay within the disk budget."""
+    started_ns: int = 0
+    at_ns: int = 0
+
+
+class ChannelInfo(Struct, frozen=True, kw_only=True):
+    """One channel of a log: `key` is the MCAP topic; `schema` is empty for a schemaless one."""
+
+    key: str
+    messages: int
+    schema: str = ""
+    encoding: str = ""
+
+
+class LogInfo(Struct, frozen=True, kw_only=True):
+    """What is in a log file."""
+
+    path: str
+    size_bytes: int
+    messages: int
+    channels: tuple[ChannelInfo, ...]
+    start_ns: int = 0
+    end_ns: int = 0
+    recovered: bool = False
+    """The file was not finished (recorder killed, power cut, disk full): all whole chunks of it were read."""
+    dropped: int = 0
+    """Messages that the recorder could not write, by its own account in the log's gaps."""
+    not_heard: int = 0
+    """Messages of the fleet that never reached the recorder, by the numbers that senders give to theirs."""
+    not_received: int = 0
+    """Frames that vehicles sent and no gateway received, by the numbers of their frames."""
+    missed: dict[str, int] = {}
+    """`dropped` and `not_heard` together, by kind of key."""
+    attachments: tuple[str, ...] = ()
+    """Names of what is attached: the configuration, the versions, plans."""
+    incidents: tuple[Incident, ...] = ()
+    problems: tuple[str, ...] = ()
+    metadata: dict[str, str] = {}
+    """Fleet, version, recorder and start, as the recorder wrote them."""
+
+    @property
+    def duration_s(self) -> float:
+        """First to last message, seconds."""
+        return max(0, self.end_ns - self.start_ns) / 1e9
+
+
+@lru_cache(maxsize=1024)
+def compile_expression(expression: str) -> re.Pattern[str]:
+    """Return the pattern whose `fullmatch` accepts the keys that `expression` includes."""
+    # Each chunk takes the slash after it or the end, so that `**` can stand for no chunk without a slash left over.
+    out = ""
+    for chunk in expression.split("/"):
+        if chunk == "**":
+            out += "(?:[^/]+(?:/|$))*"
+        else:
+            body = "[^/]+" if chunk == "*" else "[^/]*".join(re.escape(part) for part in chunk.split("$*"))
+            out += f"{body}(?:/|$)"
+    return re.compile(out)
+
+
+def check_expression(expression: str) -> str:
+    """Return a key expression that a person has written; ConfigError for one that would never match what is meant.
+
+    Stars beside other text are those of a shell, not of Zenoh. Slashes are let through as they come: topics of other
+    writers begin with one.
+    """
+    wrong = not expression or any(
+        ("*" in chunk.replace("$*", "") and chunk not in ("*", "**")) or "$" in chunk.replace("$*", "") or "?" in chunk
+        for chunk in expression.split("/")
+    )
+    if wrong:
+        raise ConfigError(
+            f"{expression[:80]!r} is no key expression",
+            remedy="`*` is one chunk between slashes, `**` any number, `$*` any text within one: **/gw-$*/log",
+        )
+    return expression
+
+
+def matches(expression: str, key: str) -> bool:
+    """Whether `expression` includes `key`."""
+    return compile_expression(expression).fullmatch(key) is not None
+
+
+MOST_RECORDERS = 8
+SILENT_S = 5.0
+"""A recorder tells of itself every second; without word for so long something is wrong with it."""
+FORGET_S = 3600.0
+"""One that was not heard for so long is not expected any more."""
+SILENT = "silent"
+_KINDS = 10
+"""Kinds of keys that a note names; the rest are counted together."""
+
+
+class Recorders:
+    """The recorders as heard; times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._heard: dict[str, tuple[RecorderStatus, float]] = {}
+
+    def hear(self, status: RecorderStatus, now: float) -> bool:
+        """Take a recorder's account of itself; whether anything of its note is new. One that stops is forgotten."""
+        before = self.notes(now)
+        if status.state == "stopped":
+            self._heard.pop(status.id, None)
+        elif status.id in self._heard or len(self._heard) < MOST_RECORDERS:
+            self._heard[status.id] = (status, now)
+        return self.notes(now) != before
+
+    def notes(self, now: float) -> tuple[RecorderNote, ...]:
+        """Return what is to be known of each, by name."""
+        gone = [name for name, (_, at) in self._heard.items() if now - at > FORGET_S]
+        for name in gone:
+            del self._heard[name]
+        return tuple(note_of(status, silent=now - at > SILENT_S) for _, (status, at) in sorted(self._heard.items()))
+
+
+def note_of(status: RecorderStatus, *, silent: bool = False) -> RecorderNote:
+    """Return the part of a recorder's status that others are told of."""
+    most = sorted(status.missed.items(), key=lambda each: (-each[1], each[0]))
+    keys = dict(most[:_KINDS])
+    if rest := sum(count for _, count in most[_KINDS:]):
+        keys["(others)"] = rest
+    return RecorderNote(
+        id=status.id,
+        state=SILENT if silent else status.state,
+        problem=status.problem[:300],
+        missed=sum(status.missed.values()),
+        keys=keys,
+        missed_at_ns=status.missed_at_ns,
+    )
+
+
+def kinds_text(keys: Mapping[str, int], *, most: int = 3) -> str:
+    """Return kinds of keys with their counts, the largest first: `gw/*/log 12, robot/*/mavlink/* 3`."""
+    ranked = sorted(keys.items(), key=lambda each: (-each[1], each[0]))
+    named = [f"{kind[:60]} {count:,}" for kind, count in ranked[:most]]
+    more = len(ranked) - most
+    return ", ".join(named) + (f" and {more} more" if more > 0 else "")
+
+
+def problem_of(note: RecorderNote) -> str:
+    """Return what is wrong with a recorder, in one line; empty when nothing is."""
+    parts: list[str] = []
+    if note.state == SILENT:
+        parts.append(f"not heard for more than {SILENT_S:g} s")
+    elif note.problem:
+        parts.append(note.problem)
+    if note.missed:
+        parts.append(f"missed {note.missed:,} messages of keys {kinds_text(note.keys)}")
+    return "; ".join(parts)
+
+
+def together(notes: Iterable[RecorderNote]) -> tuple[RecorderNote, ...]:
+    """Return one note for each recorder of what several gateways tell: a gateway that is cut off knows less.
+
+    The one with the most misses; silent only where all call it so.
+    """
+    found: dict[str, RecorderNote] = {}
+    for note in notes:
+        old = found.get(note.id)
+        if old is None or (note.state != SILENT, note.missed) > (old.state != SILENT, old.missed):
+            found[note.id] = note
+    return tuple(found[name] for name in sorted(found))
