@@ -221,7 +221,7 @@ FOXGLOVE = "foxglove"
 NOT_HEARD = "not heard"
 """Reason of a gap that is not the recorder's doing."""
 PLANE = "plane"
-"""Source of what sessions have put and the recorder was not linked for (`record.following`)."""
+"""Source of what sessions have put and the recorder was not linked for (`record.backfill`)."""
 MOST_KINDS = 50
 """Kinds of keys that misses are counted by; further ones are counted together."""
 OTHERS = "(others)"

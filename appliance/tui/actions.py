@@ -63,7 +63,7 @@ class Action(Struct, frozen=True, kw_only=True):
     """Something a person can do."""
 
     name: str
-    """The command's word after the colon, and what `tui.keys` calls it."""
+    """The command's word after the colon, and what a person's settings call it."""
     title: str
     """What the footer says."""
     help: str

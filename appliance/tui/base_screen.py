@@ -20,7 +20,7 @@ from textual.widgets import Static
 from appliance.tui import actions
 from appliance.tui.actions import Action, key_name, keys_of
 from appliance.tui.command_line import Filter
-from appliance.tui.formatting import counted
+from appliance.tui.formatting import counted, time_of_day
 from appliance.tui.safe import safe
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Store
@@ -270,7 +270,7 @@ class FleetScreen(Screen[None], inherit_bindings=False):
         banner, connection = self.query_one("#banner", Static), store.connection
         banner.display = not connection.connected
         if not connection.connected:
-            since = f", since {clock(connection.since_ns)}" if connection.since_ns else ""
+            since = f", since {time_of_day(connection.since_ns)}" if connection.since_ns else ""
             banner.update(
                 Text.assemble(
                     (f"✘ {safe(connection.problem, 200)}{since}", "bold"), f" → {safe(connection.remedy, 200)}"

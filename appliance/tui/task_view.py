@@ -213,7 +213,7 @@ def subtask_cells(node: Node) -> tuple[Cell, ...]:
     sign = status_styles.subtask(record.state)
     share = f" {min(1.0, max(0.0, record.progress)):.0%}" if record.progress and not record.state.final else ""
     return (
-        (f"{shape.branch(node.depth)}{safe(record.subtask.id, 30)}", "bold"),
+        (f"{plan_editor.branch(node.depth)}{safe(record.subtask.id, 30)}", "bold"),
         (safe(record.subtask.skill, 40), "cyan"),
         safe(_robot(record) or "–", 40),
         (f"{sign.text}{share}", sign.style),

@@ -1,8 +1,9 @@
 """How the terminal UI looks: themes for dark and light rooms, for eyes that tell red from green badly, and for glare.
 
-Text is styled with the names of a terminal's colours, each of which stands for a part (`signs`): a theme says what they
-look like. In the colour-blind-safe ones well is blue and broken is vermilion, after Okabe and Ito's palette (Color
-Universal Design, 2008); in those of high contrast every text has at least 7:1 against its ground (WCAG 2.2, 1.4.6).
+Text is styled with the names of a terminal's colours, each of which stands for a part (`status_styles`): a theme says
+what they look like. In the colour-blind-safe ones well is blue and broken is vermilion, after Okabe and Ito's palette
+(Color Universal Design, 2008); in those of high contrast every text has at least 7:1 against its ground (WCAG 2.2,
+1.4.6).
 """
 
 from msgspec import Struct

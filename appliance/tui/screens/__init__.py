@@ -1,6 +1,6 @@
 """The screens of the terminal UI; titles and number keys are in `actions.SCREENS`.
 
-Those of the fleet, the pool and the planner are here; tasks, robots, the log and replay have rooms of their own.
+Opened from others, and so not in the list: `takeover`, `review` and `submit`.
 """
 
 from appliance.tui.base_screen import FleetScreen

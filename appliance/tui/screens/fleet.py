@@ -27,7 +27,7 @@ from appliance.tui import status_styles
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.command_line import plain_image
-from appliance.tui.formatting import Cell, age, bar, counted, hanging, milliseconds, sparkline
+from appliance.tui.formatting import Cell, age, bar, counted, hanging, milliseconds, sparkline, time_of_day
 from appliance.tui.safe import safe
 from appliance.tui.store import SILENT, Gateway, Start, Store
 from appliance.tui.widgets.grid import Column, Grid
@@ -55,7 +55,7 @@ def gateway_state(gateway: Gateway) -> tuple[str, str]:
     """Return a gateway's state in few words, with its sign and style; `notes_of` has the whole story."""
     status = gateway.status
     if gateway.lost_ns:
-        return f"✘ lost {clock(gateway.lost_ns)[:5]}", "red"
+        return f"✘ lost {time_of_day(gateway.lost_ns)[:5]}", "red"
     if status.draining:
         return "◌ draining", "magenta"
     if status.pool_problem:
@@ -71,7 +71,7 @@ def notes_of(gateway: Gateway) -> list[Note]:
     """Return what is to be known of a gateway, the worst first."""
     each, name = gateway.status, safe(gateway.status.id, 63)
     if gateway.lost_ns:
-        gone = f"not reachable since {clock(gateway.lost_ns)}"
+        gone = f"not reachable since {time_of_day(gateway.lost_ns)}"
         remedy = "see to its power, network, service"
         return [Note(weight=0, about="gateway", glyph="✘", style="red", text=gone, remedy=remedy)]
     found: list[Note] = []
@@ -215,7 +215,7 @@ def decision_lines(decisions: Sequence[Decision], most: int, width: int = 0) -> 
     for gateway, each in decisions[:most]:
         glyph, style = _SIGNS.get(each.what, ("?", "bold"))
         line = Text.assemble(
-            (f"{clock(each.at_ns)} ", "dim"), (f"{glyph} {safe(each.what, 10):<7}", style),
+            (f"{time_of_day(each.at_ns)} ", "dim"), (f"{glyph} {safe(each.what, 10):<7}", style),
             f"{safe(gateway, 20):<10} {safe(each.image.rsplit('/', 1)[-1], 20):<10} ",
         )  # fmt: skip
         margin = " " * cell_len(line.plain)
@@ -396,7 +396,7 @@ class GatewayScreen(FleetScreen):
         self._show("#runs", running[:6])
         said = [each for each in store.entries if each.source == self._gateway][-_LOG_LINES:]
         lines = [
-            Text.assemble((f"{clock(each.at_ns)} ", "dim"), (each.text, status_styles.level(each.level).style))
+            Text.assemble((f"{time_of_day(each.at_ns)} ", "dim"), (each.text, status_styles.level(each.level).style))
             for each in said
         ]
         self._show("#lines", lines)

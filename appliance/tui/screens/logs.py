@@ -145,7 +145,7 @@ def entry_text(entry: Entry) -> Text:
 
 def entry_plain(entry: Entry) -> str:
     """Return a line as filters see it."""
-    return f"{clock(entry.at_ns)} {entry.kind} {entry.level} {entry.source} {entry.text}"
+    return f"{time_of_day(entry.at_ns)} {entry.kind} {entry.level} {entry.source} {entry.text}"
 
 
 def heard_text(message: Heard) -> Text:

@@ -40,7 +40,7 @@ def step_cells(node: tuple[Subtask, int]) -> tuple[Cell, ...]:
     """Return the row of a subtask of a draft."""
     subtask, depth = node
     return (
-        (f"{shape.branch(depth)}{safe(subtask.id, 30)}", "bold"),
+        (f"{plan_editor.branch(depth)}{safe(subtask.id, 30)}", "bold"),
         (safe(subtask.skill, 40), "cyan"),
         safe(subtask.robot or "a gateway", 63),
         safe(params_text(subtask.params), 200),

@@ -24,6 +24,7 @@ from textual.widgets import Input, Label, Static
 from appliance.errors import PlanError, SwiftbotError
 from appliance.model import Approval, Site, TaskRecord, TaskRequest
 from appliance.tasks.api import PlanAnswer
+from appliance.tui import plan_editor
 from appliance.tui.actions import DIALOG_KEYS, key_name
 from appliance.tui.safe import safe
 from appliance.tui.subscriptions import View
@@ -216,7 +217,7 @@ def answer_text(answer: PlanAnswer) -> Text:
     count = len(plan.subtasks)
     out = Text()
     out.append(
-        f"{safe(plan.domain, 40)}: {count} subtask{'s' if count != 1 else ''}, {shape.at_once(plan)} at once · "
+        f"{safe(plan.domain, 40)}: {count} subtask{'s' if count != 1 else ''}, {plan_editor.at_once(plan)} at once · "
         f"{plan.tier} tier, {plan.confidence:.0%} sure, {plan.latency_ms:.0f} ms\n",
         "bold",
     )
