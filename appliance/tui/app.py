@@ -34,15 +34,32 @@ from appliance.tui.base_screen import FleetScreen
 from appliance.tui.command_line import Command
 from appliance.tui.replay import ReplayView
 from appliance.tui.safe import safe
-from appliance.tui.screens import SCREENS
+from appliance.tui.screens.fleet import FleetOverview, PoolScreen
+from appliance.tui.screens.logs import LogScreen
+from appliance.tui.screens.models import LearningScreen, LlmScreen
+from appliance.tui.screens.replay import ReplayScreen
 from appliance.tui.screens.review import ReviewScreen
+from appliance.tui.screens.robots import RobotsScreen
 from appliance.tui.screens.submit import History, SubmitDialog, default_file
 from appliance.tui.screens.takeover import TakeoverScreen
+from appliance.tui.screens.tasks import TasksScreen
 from appliance.tui.settings import TuiConfig
 from appliance.tui.subscriptions import FleetView, View, take_own_log
 from appliance.tui.task_view import state_cell
 from appliance.tui.widgets import Lines
 from appliance.tui.widgets.dialogs import ConfirmDialog, HelpDialog, TextDialog
+
+SCREENS: dict[str, type[FleetScreen]] = {
+    "fleet": FleetOverview,
+    "tasks": TasksScreen,
+    "robots": RobotsScreen,
+    "pool": PoolScreen,
+    "llm": LlmScreen,
+    "learning": LearningScreen,
+    "log": LogScreen,
+    "replay": ReplayScreen,
+}
+"""By the name that their action has."""
 
 _FONT = re.compile(r"@font-face \{[^}]*\}\s*")
 

@@ -9,10 +9,9 @@ from textual.widgets import DataTable
 
 from appliance.model import TaskRecord
 from appliance.tui import status_styles
-from appliance.tui.app import SwiftbotApp
+from appliance.tui.app import SCREENS, SwiftbotApp
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.safe import safe
-from appliance.tui.screens import SCREENS
 from appliance.tui.store import Store
 
 TITLES = ("task", "state", "first step", "instruction")
