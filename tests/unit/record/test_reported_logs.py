@@ -18,8 +18,8 @@ from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 from tests.unit.record.test_edit import write
 from tests.unit.record.test_reader import MESSAGES, PACKED, PLAIN
-from tests.unit.record.test_writer import JSON, KEYS, Clock, Disk, LogWriter, RecordConfig, _gaps, _message, _numbers
-from tests.unit.record.test_writer import _writer as writer_of
+from tests.unit.record.test_segments import JSON, KEYS, Clock, Disk, LogWriter, RecordConfig, _gaps, _message, _numbers
+from tests.unit.record.test_segments import _writer as writer_of
 
 SECOND = 10**9
 

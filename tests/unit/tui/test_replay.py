@@ -20,7 +20,7 @@ from appliance.tui.subscriptions import Hearing
 
 pytestmark = pytest.mark.anyio
 
-LOG = Path(__file__).parents[3] / "replay" / "logs" / "demo.mcap"
+LOG = Path(__file__).parents[2] / "replay" / "logs" / "demo.mcap"
 """A real log of a local fleet."""
 
 
