@@ -15,8 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from write_configuration import fields
 
 from appliance.tui import themes
-from appliance.tui.actions import ACTIONS, SCREENS
-from appliance.tui.actions import names
+from appliance.tui.actions import ACTIONS, SCREENS, names
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = ROOT / "docs" / "tui.md"

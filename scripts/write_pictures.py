@@ -20,9 +20,9 @@ from appliance.model import Approval, TaskRequest  # noqa: E402
 from appliance.plane.settings import PlaneConfig  # noqa: E402
 from appliance.pool.settings import PoolConfig  # noqa: E402
 from appliance.tui.app import SwiftbotApp  # noqa: E402
-from appliance.tui.subscriptions import FleetView  # noqa: E402
 from appliance.tui.replay import ReplayView  # noqa: E402
 from appliance.tui.settings import TuiConfig  # noqa: E402
+from appliance.tui.subscriptions import FleetView  # noqa: E402
 from workshop import local_fleet  # noqa: E402 - a script finds the project beside itself
 from workshop.local_fleet import Order  # noqa: E402
 
