@@ -28,30 +28,28 @@ from appliance.pool.transfer.api import Brought, FetchAsk
 from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
 from appliance.steering import SteeringCalls
 from appliance.tasks.api import (
+    DrainAsk,
+    DrainState,
+    DrainStateAsk,
     ExperienceAsk,
     ExperienceList,
+    MigrateAsk,
+    Migrated,
+    MoveAsk,
+    MoveCancelled,
     PlanAnswer,
     PlanAsk,
     SiteAsk,
     TaskAsk,
     TaskList,
     TasksAsk,
+    UndrainAsk,
     WhyAsk,
 )
-from appliance.tasks.migration.api import (
-    DrainAsk,
-    DrainState,
-    DrainStateAsk,
-    MigrateAsk,
-    Migrated,
-    MoveAsk,
-    MoveCancelled,
-    UndrainAsk,
-)
+from appliance.tasks.lines import Line
 from appliance.tasks.migration.moving import MOVE_S
-from appliance.tasks.watch.lines import Line
-from appliance.tasks.watch.stream import Stream
-from appliance.tasks.why import TaskWhy
+from appliance.tasks.stream import Stream
+from appliance.tasks.views import TaskWhy
 
 __all__ = ["Endpoint", "FleetClient"]
 

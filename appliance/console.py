@@ -37,10 +37,9 @@ from appliance.reasons import milliseconds
 from appliance.record.models import LogInfo, kinds_text, problem_of, together
 from appliance.record.player import Played
 from appliance.tasks.api import PlanAnswer
-from appliance.tasks.check import CheckReport
-from appliance.tasks.remembering import done_text
-from appliance.tasks.replay import ReplayReport
-from appliance.tasks.why import waits_for
+from appliance.tasks.replay import CheckReport, ReplayReport
+from appliance.tasks.retention import done_text
+from appliance.tasks.views import waits_for
 
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from rich.text import Text
 
 from appliance.model import TaskRecord
-from appliance.tasks.watch.lines import Line, LineKind
+from appliance.tasks.lines import Line, LineKind
 
 _STYLES = {
     LineKind.STATE: "",

@@ -54,17 +54,17 @@ from appliance.skills.sites import load_site
 from appliance.state_here import StateHere
 from appliance.tasks.api import ArtifactAsk, RunAsk, SiteAsk, TaskLinesAsk
 from appliance.tasks.artifacts import Artifacts
-from appliance.tasks.calls import Calls
+from appliance.tasks.audit import Audit
+from appliance.tasks.enquiries import Enquiries
 from appliance.tasks.executor import Executor
+from appliance.tasks.handler_calls import Calls
 from appliance.tasks.manager import TaskManager
-from appliance.tasks.migration.leaving import Leaving
-from appliance.tasks.migration.migration import Migration
-from appliance.tasks.migration.overload import Load
-from appliance.tasks.remote import RemoteContainers
+from appliance.tasks.migration.gateway import Migration
+from appliance.tasks.migration.handoff import Leaving
+from appliance.tasks.migration.policy import Load
+from appliance.tasks.offload import RemoteContainers
 from appliance.tasks.retention import Retention
-from appliance.tasks.steering.audit import Audit
-from appliance.tasks.steering.enquiries import Enquiries
-from appliance.tasks.watch.kept import Kept
+from appliance.tasks.stream import Kept
 from appliance.vitals import Vitals
 
 log = structlog.get_logger(__name__)

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.model import PLAIN_PRIORITY, Choice
-from appliance.tasks.why import AttemptWhy, TaskWhy, Waits
+from appliance.tasks.views import AttemptWhy, TaskWhy, Waits
 
 
 def milliseconds(value: float | None) -> str:

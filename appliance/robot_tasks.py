@@ -14,10 +14,9 @@ from appliance.llm.safety.settings import SafetyConfig
 from appliance.model import TaskRecord, TaskRequest
 from appliance.plane.node import Plane
 from appliance.robots.task_listener import Tasks
-from appliance.tasks.api import TaskAsk
-from appliance.tasks.bounds import clean
+from appliance.tasks.api import CancelTaskAsk, TaskAsk
 from appliance.tasks.manager import TaskManager
-from appliance.tasks.steering.api import CancelTaskAsk
+from appliance.tasks.records import clean
 
 log = structlog.get_logger(__name__)
 

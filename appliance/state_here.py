@@ -20,7 +20,7 @@ from appliance.pool.state import ALONE, State
 from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.transfers import Transfers
 from appliance.pool.volumes import Volumes
-from appliance.tasks.remote import Links, UnmeasuredLinks
+from appliance.tasks.offload import Links, UnmeasuredLinks
 
 log = structlog.get_logger(__name__)
 

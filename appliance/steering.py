@@ -39,7 +39,7 @@ from appliance.robots.api import (
     TakeAsk,
 )
 from appliance.robots.sender import tell_to_hold
-from appliance.tasks.steering.api import (
+from appliance.tasks.api import (
     ActList,
     ActsAsk,
     AnswerAsk,

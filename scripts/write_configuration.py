@@ -29,9 +29,9 @@ SECTIONS = (
     ("robots.mavlink", "appliance.robots.settings", "MavlinkLink"),
     ("record", "appliance.record.settings", "RecordConfig"),
     ("tasks", "appliance.tasks.settings", "TasksConfig"),
-    ("tasks.detection", "appliance.tasks.detection", "DetectionConfig"),
-    ("tasks.replan", "appliance.tasks.replan.settings", "ReplanConfig"),
-    ("tasks.migration", "appliance.tasks.migration.settings", "MigrationConfig"),
+    ("tasks.detection", "appliance.tasks.durations", "DetectionConfig"),
+    ("tasks.replan", "appliance.tasks.settings", "ReplanConfig"),
+    ("tasks.migration", "appliance.tasks.settings", "MigrationConfig"),
 )
 HEAD = """# Configuration
 

@@ -10,7 +10,7 @@ from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.cli.work import task_app
 from appliance.client import FleetClient
 from appliance.errors import Exit, SwiftbotError
-from appliance.tasks.migration.api import DrainState, MigrateAsk, Migrated
+from appliance.tasks.api import DrainState, MigrateAsk, Migrated
 
 LOOK_S = 0.5
 

@@ -11,7 +11,7 @@ from appliance.client import FleetClient
 from appliance.errors import ConfigError, Exit
 from appliance.pool.api import WarmAsk
 from appliance.reasons import why_text
-from appliance.tasks.why import why
+from appliance.tasks.views import why
 
 pool_app = App(name="pool", help="Warm containers: what there is, why it was chosen, and what is kept.", group=WORK)
 

@@ -176,7 +176,7 @@ def log_check(paths: tuple[Path, ...], *, as_json: Json = False) -> int:
         paths: The logs.
         as_json: Print JSON.
     """
-    from appliance.tasks.check import check
+    from appliance.tasks.replay import check
 
     _named(paths)
     with console.err.status("reading") as status:

@@ -20,7 +20,7 @@ from appliance.errors import ConfigError, Exit, SwiftbotError
 from appliance.model import Plan, TaskRecord
 from appliance.robots.api import StopAnswer
 from appliance.steering import read_plan_file
-from appliance.tasks.view import view
+from appliance.tasks.views import view
 
 if TYPE_CHECKING:
     from appliance.stopping import Stopped

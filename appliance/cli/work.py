@@ -19,7 +19,7 @@ from appliance.errors import ConfigError, Exit, UnapprovedError
 from appliance.model import PLAIN_PRIORITY, Approval, TaskRecord, TaskRequest, TaskState
 from appliance.reasons import why_text
 from appliance.steering import cancel_outcome
-from appliance.tasks.view import view
+from appliance.tasks.views import view
 
 task_app = App(name="task", help="List, show, watch, move and cancel tasks, and decide on their plans.", group=WORK)
 

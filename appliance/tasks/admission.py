@@ -22,7 +22,7 @@ from appliance.model import (
     oversize,
 )
 from appliance.plane.keys import check_name
-from appliance.tasks.bounds import MAX_DEPTH, too_deep
+from appliance.tasks.records import MAX_DEPTH, too_deep
 from appliance.tasks.settings import TasksConfig
 
 MAX_SUBMITTER = 120

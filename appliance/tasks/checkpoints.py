@@ -21,7 +21,7 @@ from appliance.errors import ConflictError, SwiftbotError
 from appliance.model import RunEvent, RunEventKind, VersionVector, encode
 from appliance.plane.dht import Dht
 from appliance.pool.selection import size_text
-from appliance.tasks.bounds import result_problem
+from appliance.tasks.records import result_problem
 
 log = structlog.get_logger(__name__)
 

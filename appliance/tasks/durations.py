@@ -1,20 +1,33 @@
-"""How long subtasks take: per skill the median of the last runs that this gateway coordinated.
+"""How long runs take: expected durations by skill, and which runs are stuck or straggling.
 
-The manifest's time limit says how long a run may take, which is far more than it does: too long to plan with. What
-was measured is kept in the gateway's store and survives a restart.
+**Expected durations.** Per skill the median of the last runs that this gateway coordinated. The manifest's time limit
+says how long a run may take, which is far more than it does: too long to plan with. What was measured is kept in the
+gateway's store and survives a restart. All times are seconds.
+
+**Stuck**: no sign of life (progress, log line, partial result, checkpoint, or the heartbeat that stands for waiting on
+the appliance) for longer than its skill promises (`silent_s` of its manifest), or, where it promises nothing, for much
+longer than runs of it took altogether. Without either nothing is known, and the run's deadline is the only bound.
+
+**Straggling**: running much longer than runs of the skill do, by this gateway's own experience or by its siblings
+of the same skill in the same task; the thresholds are those of speculation in MapReduce and Spark (a quantile of the
+finished ones, times a factor, never below a minimum). Detection is pure, with the clock passed in.
 """
 
 import asyncio
+import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from statistics import median
 from typing import Any, Protocol
 
 import msgspec
 import structlog
+from msgspec import Struct
 
 from appliance.errors import SwiftbotError
 from appliance.model import encode
+from appliance.skills.catalogue import SkillManifest
 
 log = structlog.get_logger(__name__)
 
@@ -97,3 +110,118 @@ class Durations:
         if self._writer is not None:
             self._writer.cancel()
         await self.write()
+
+
+class DetectionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When a run is taken for stuck or straggling."""
+
+    stuck_factor: float = 6.0
+    """A silent run of a skill that promises no signs of life is stuck after so many times what runs of it take (at the
+    quantile): ending one that only has more to do than usual costs more than waiting."""
+    stuck_minimum_s: float = 60.0
+    """Never before, unless the manifest promises signs of life more often."""
+    straggler_factor: float = 2.0
+    """A run straggles after so many times what others take (Spark's `speculation.multiplier` is 1.5, later 3)."""
+    straggler_minimum_s: float = 5.0
+    """Never before: below it moving on costs about as much as it saves."""
+    quantile: float = 0.9
+    """Which of the known durations counts: not the median, or a tenth of all runs in a spread of two would straggle."""
+    samples: int = 5
+    """Runs of a skill that must be known before its durations are believed."""
+    siblings: int = 3
+    """Finished siblings of the same skill in the same task that do as well; their largest duration counts."""
+
+
+class Condition(StrEnum):
+    """What is wrong with a run."""
+
+    STUCK = "stuck"
+    STRAGGLING = "straggling"
+
+
+class Finding(Struct, frozen=True, kw_only=True):
+    """What is wrong with a run, in words for people, and the bound it has passed, in seconds."""
+
+    condition: Condition
+    bound_s: float
+    note: str
+
+
+class Known(Struct, frozen=True, kw_only=True):
+    """Durations that are known of runs like this one, seconds."""
+
+    learned: Sequence[float] = ()
+    siblings: Sequence[float] = ()
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Return the smallest value that at least a share of the values do not exceed; 0 when there are none."""
+    if not values:
+        return 0.0
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, max(0, math.ceil(share * len(ordered)) - 1))]
+
+
+def usual_s(known: Known, config: DetectionConfig) -> float | None:
+    """Return how long runs like this one take, seconds; None when too little is known."""
+    found: list[float] = []
+    if len(known.learned) >= config.samples:
+        found.append(quantile(known.learned, config.quantile))
+    if len(known.siblings) >= config.siblings:
+        found.append(max(known.siblings))
+    # Siblings do the same on the same day, experience is longer: the more patient of the two is believed.
+    return max(found) if found else None
+
+
+def stuck_after_s(manifest: SkillManifest, known: Known, asked_s: float, config: DetectionConfig) -> float | None:
+    """Return how long a run may be silent, seconds; None when nothing is known but its deadline."""
+    if manifest.silent_s > 0:
+        return manifest.silent_s
+    usual = usual_s(known, config)
+    return None if usual is None else max(config.stuck_minimum_s, config.stuck_factor * max(usual, asked_s))
+
+
+def straggles_after_s(known: Known, asked_s: float, config: DetectionConfig) -> float | None:
+    """Return how long a run may take before it straggles, seconds; None when too little is known."""
+    usual = usual_s(known, config)
+    return None if usual is None else max(config.straggler_minimum_s, config.straggler_factor * max(usual, asked_s))
+
+
+def judge(
+    manifest: SkillManifest,
+    *,
+    running_s: float,
+    silent_s: float,
+    known: Known,
+    asked_s: float,
+    config: DetectionConfig,
+) -> Finding | None:
+    """Return what is wrong with a run that has started; stuck counts before straggling.
+
+    Args:
+        manifest: of its skill.
+        running_s: since the first line of its handler.
+        silent_s: since its last sign of life.
+        known: durations of runs like it.
+        asked_s: how long it was asked to take (`duration_s`), 0 when it was not.
+        config: the thresholds.
+    """
+    bound = stuck_after_s(manifest, known, asked_s, config)
+    if bound is not None and silent_s > bound:
+        said = "its skill promises" if manifest.silent_s > 0 else f"{manifest.id} leads one to expect"
+        note = f"stuck: no sign of life for {silent_s:.1f} s, {bound:.1f} s is what {said}"
+        return Finding(condition=Condition.STUCK, bound_s=bound, note=note)
+    bound = straggles_after_s(known, asked_s, config)
+    if bound is not None and running_s > bound:
+        usual = usual_s(known, config) or 0.0
+        note = f"straggling: runs for {running_s:.1f} s, others took {usual:.1f} s"
+        return Finding(condition=Condition.STRAGGLING, bound_s=bound, note=note)
+    return None
+
+
+def asked_s(params: dict[str, Any]) -> float:
+    """Return how long a run was asked to take, seconds; 0 when it was not."""
+    value = params.get("duration_s", 0.0)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 86_400:
+        return 0.0
+    return float(value)

@@ -1,29 +1,24 @@
 """Runs attempts of subtasks on this gateway: selection, start, events, and what is known of past runs.
 
 It knows nothing of plans. It accepts an order, answers where it will run, and publishes what becomes of it
-under the task's key; the last event of each run is kept in SQLite until the task's record has moved on, so a
-coordinator that comes later can ask.
+under the task's key: numbered, stamped, and with the time of the run's last sign of life (`Telling`). The last event of
+each run is kept in SQLite, over a restart too, until the task's record has moved on, so a coordinator that comes later
+can ask (`KeptRuns`); of the many that nobody asks after the oldest go.
 """
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Coroutine
+from typing import Any, Protocol
 
+import msgspec
 import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
-from appliance.model import (
-    Failure,
-    Phase,
-    PoolHint,
-    RunAccepted,
-    RunEvent,
-    RunEventKind,
-    RunRequest,
-)
+from appliance.model import Failure, Phase, PoolHint, RunAccepted, RunEvent, RunEventKind, RunRequest, encode
 from appliance.plane.keys import check_name, run_of
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
@@ -31,18 +26,131 @@ from appliance.pool.api import Hinted
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.bounds import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.checkpoints import Checkpoints
-from appliance.tasks.choosing import Choosing
-from appliance.tasks.elsewhere import Elsewhere
-from appliance.tasks.kept_runs import KeptRuns
-from appliance.tasks.passing import PassedOn, Passing, whereabouts
-from appliance.tasks.remote import RemoteContainers
+from appliance.tasks.context import task_key
+from appliance.tasks.offload import Choosing, Elsewhere, PassedOn, Passing, RemoteContainers, whereabouts
+from appliance.tasks.records import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.surroundings import task_key
-from appliance.tasks.telling import Telling
+
+MOST_RUNS = 4000
+"""Runs whose numbers are remembered: more than a gateway keeps of ended ones."""
+
+
+class Telling:
+    """The voice of one gateway's runs. `on_told` hears all that is published."""
+
+    def __init__(self, plane: Plane) -> None:
+        self._plane = plane
+        self._numbers: OrderedDict[tuple[str, str, int], int] = OrderedDict()
+        self._heard: dict[tuple[str, str, int], float] = {}
+        self.on_told: Callable[[RunEvent], None] = lambda _: None
+
+    def tell(self, event: RunEvent) -> None:
+        """Publish an event."""
+        run = (event.task, event.subtask, event.attempt)
+        # A mere sign of life is no line of anybody's stream: it takes no number, so that none seems to be missing.
+        number = self._numbers.get(run, 0) + (event.kind is not RunEventKind.ALIVE)
+        self._numbers[run] = number
+        self._numbers.move_to_end(run)
+        self._heard[run] = time.monotonic()
+        while len(self._numbers) > MOST_RUNS:
+            self._heard.pop(self._numbers.popitem(last=False)[0], None)
+        event = replace(event, number=number, at_ns=time.time_ns())
+        self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event), express=True)
+        self.on_told(event)
+
+    def silent_s(self, task: str, subtask: str, attempt: int) -> float | None:
+        """Return the seconds since a run's last sign of life; None when nothing was told of it."""
+        heard = self._heard.get((task, subtask, attempt))
+        return None if heard is None else time.monotonic() - heard
+
 
 log = structlog.get_logger(__name__)
+
+KEPT_RUNS = 2000
+"""Last events kept of ended runs; a coordinator asks within seconds."""
+_PREFIX = "run/"
+
+
+class KeyValues(Protocol):
+    """What is needed of the gateway's store."""
+
+    async def put(self, key: str, value: bytes, *, durable: bool = True) -> None:
+        """Keep a value."""
+        ...
+
+    async def delete(self, key: str) -> object:
+        """Forget a key."""
+        ...
+
+    async def scan(self, prefix: str) -> list[tuple[str, bytes]]:
+        """Return what is kept under keys of that prefix."""
+        ...
+
+
+class KeptRuns:
+    """Events by run id, and the newest attempt of each subtask."""
+
+    def __init__(self, store: KeyValues, gateway: str) -> None:
+        self.last: dict[str, RunEvent] = {}
+        """Run id -> its last event that counts for a coordinator."""
+        self._store = store
+        self._gateway = gateway
+        self._newest: dict[tuple[str, str], int] = {}
+
+    async def load(self) -> dict[str, str]:
+        """Load what was kept; a run that was in progress when the gateway went down has failed.
+
+        Returns:
+            Run id -> gateway, of the runs that were passed on.
+        """
+        moved: dict[str, str] = {}
+        for key, value in await self._store.scan(_PREFIX):
+            run_id = key.removeprefix(_PREFIX)
+            try:
+                event = msgspec.json.decode(value, type=RunEvent)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                log.warning("a kept run event cannot be read and is dropped", run=run_id, reason=str(error))
+                await self._store.delete(key)
+                continue
+            if event.gateway not in ("", self._gateway):
+                moved[run_id] = event.gateway
+            elif event.kind not in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
+                message = f"{self._gateway} was restarted while it ran"
+                failure = Failure(code="unreachable", message=message, retryable=True)
+                event = replace(event, kind=RunEventKind.FAILED, failure=failure)
+                await self._store.put(key, encode(event))
+            self._note(run_id, event)
+        return moved
+
+    async def keep(self, run_id: str, event: RunEvent) -> None:
+        """Keep an event over a restart; a store that cannot must not keep the outcome from being told."""
+        try:
+            await self._store.put(f"{_PREFIX}{run_id}", encode(event), durable=False)
+        except SwiftbotError as error:
+            log.warning("run event could not be kept", run=run_id, reason=str(error))
+
+    def newest(self, task: str, subtask: str) -> int:
+        """The newest attempt of a subtask that this gateway knows of; 0: none."""
+        return self._newest.get((task, subtask), 0)
+
+    def remember(self, run_id: str, event: RunEvent, *, busy: Collection[str]) -> list[str]:
+        """Note an event; returns the runs that are too many now, oldest first, none of those in progress."""
+        self._note(run_id, event)
+        over = len(self.last) - KEPT_RUNS
+        return [] if over <= 0 else [each for each in self.last if each not in busy][:over]
+
+    def _note(self, run_id: str, event: RunEvent) -> None:
+        self.last[run_id] = event
+        subtask = event.task, event.subtask
+        self._newest[subtask] = max(event.attempt, self._newest.get(subtask, 0))
+
+    def forget(self, run_id: str) -> Coroutine[Any, Any, object]:
+        """Forget a run, and which attempt of its subtask it was; what is returned takes it off the disk."""
+        gone = self.last.pop(run_id, None)
+        if gone is not None:
+            self._newest.pop((gone.task, gone.subtask), None)
+        return self._store.delete(f"{_PREFIX}{run_id}")
 
 
 class Here(Struct):

@@ -1,18 +1,194 @@
-"""Looks ahead for the tasks of one gateway: what comes, where it would go by now, and which pools to tell.
+"""Looks ahead for the tasks of one gateway: what their plans will need, where it would go by now, which pools to tell.
 
-It ties the plain functions together (`placement`, `hints`) with what is measured (`durations`).
+A plan knows what comes: while the first subtasks run, the pools of the gateways that would be chosen for the others
+can have containers ready. `hints` works out what a task's subtasks that are not ready yet will ask of which pool, and
+about when, as a plain function; `Hinting` tells the gateways, best effort: nothing waits for it, what is lost costs a
+cold start, and what has changed replaces what was told before. A hint belongs to its task: the same task and image at
+the same gateway is one hint, and a count of 0 takes it back. `LookAhead` ties these to `placement` and to what is
+measured (`durations`).
 """
 
+import asyncio
+import time
 from collections.abc import Awaitable, Callable, Mapping
 
-from appliance.errors import NotFoundError
-from appliance.model import PoolHint, Subtask, SubtaskRecord, TaskRecord
+import structlog
+from msgspec import Struct
+
+from appliance.errors import NotFoundError, SwiftbotError
+from appliance.model import Need, PoolHint, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
 from appliance.plane.node import Plane
 from appliance.pool.api import Hinted
 from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.context import need_of
 from appliance.tasks.durations import Durations
-from appliance.tasks.hints import TELL_S, Hinting, expected_starts, hints
-from appliance.tasks.surroundings import need_of
+
+log = structlog.get_logger(__name__)
+
+HORIZON_S = 300.0
+"""What is needed later is told later: expectations so far ahead are mostly wrong."""
+KEEP_S = 30.0
+"""How long beyond its time a container is worth keeping at least: subtasks ahead of it take longer than expected."""
+MOST_KEEP_S = 600.0
+SAME_S = 1.0
+"""A change of the expected time by less is none, nor one by less than a fifth of what is left."""
+AGAIN_S = 15.0
+"""A hint is told again after so long: the one before may have been met by a run of somebody else."""
+MOST_AT_ONCE = 32
+"""Hints on their way; more are left for the next change of their plans."""
+TELL_S = 1.0
+
+
+def expected_starts(
+    record: TaskRecord, seconds: Mapping[str, float], running_s: Mapping[str, float]
+) -> dict[str, float]:
+    """Return in how many seconds each waiting subtask is expected to start, of those that may still start.
+
+    Args:
+        record: the task.
+        seconds: subtask -> how long it is expected to take.
+        running_s: subtask -> for how long it has been running or on its way.
+    """
+    by_id = {each.subtask.id: each for each in record.subtasks}
+    ends: dict[str, float] = {}
+    starts: dict[str, float] = {}
+    left = list(record.subtasks)
+    while left:
+        later: list[SubtaskRecord] = []
+        for each in left:
+            name = each.subtask.id
+            before = [parent for parent in each.subtask.after if parent in by_id]
+            if each.state is SubtaskState.WAITING and not all(parent in ends for parent in before):
+                later.append(each)
+                continue
+            if each.state.final:
+                ends[name] = 0.0
+            elif each.state is SubtaskState.WAITING:
+                starts[name] = max((ends[parent] for parent in before), default=0.0)
+                ends[name] = starts[name] + seconds.get(name, 0.0)
+            else:
+                ends[name] = max(0.0, seconds.get(name, 0.0) - running_s.get(name, 0.0))
+        if len(later) == len(left):
+            break  # a circle, which no valid plan has
+        left = later
+    return starts
+
+
+def hints(
+    record: TaskRecord,
+    *,
+    starts: Mapping[str, float],
+    places: Mapping[str, str],
+    needs: Mapping[str, Need],
+    seconds: Mapping[str, float],
+) -> dict[tuple[str, str], PoolHint]:
+    """Return what to tell each gateway's pool, by gateway and image.
+
+    Args:
+        record: the task; one that is not running needs nothing any more.
+        starts: subtask -> in how many seconds it is expected to start (`expected_starts`).
+        places: subtask -> the gateway that would be chosen for it now; others are left out.
+        needs: subtask -> what it asks of a container; others are left out.
+        seconds: subtask -> how long it is expected to take.
+
+    Returns:
+        One hint each, its count the most of these subtasks that are expected to run at the same time.
+    """
+    if record.state is not TaskState.RUNNING:
+        return {}
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for name, start in starts.items():
+        if start <= HORIZON_S and places.get(name) and name in needs:
+            grouped.setdefault((places[name], needs[name].image), []).append(name)
+    found: dict[tuple[str, str], PoolHint] = {}
+    for key, names in grouped.items():
+        spans = [(starts[name], starts[name] + seconds.get(name, 0.0)) for name in names]
+        first = min(start for start, _ in spans)
+        last = max(end for _, end in spans)
+        found[key] = PoolHint(
+            image=key[1],
+            count=max(sum(start <= at < end or start == at for start, end in spans) for at, _ in spans),
+            in_s=round(first, 2),
+            # The further ahead, the less is known of when.
+            keep_s=round(min(MOST_KEEP_S, KEEP_S + last - first + 0.5 * first), 2),
+            task=record.id,
+            need=max((needs[name] for name in names), key=lambda need: (need.memory_mb, need.cpu)),
+        )
+    return found
+
+
+class _Told(Struct, frozen=True):
+    count: int
+    at: float
+    """When it is needed, on our clock."""
+    told_at: float
+    until: float
+
+
+class Hinting:
+    """Tells gateways what plans will need of their pools.
+
+    Args:
+        tell: tells one gateway one hint.
+        clock: seconds.
+    """
+
+    def __init__(
+        self, tell: Callable[[str, PoolHint], Awaitable[Hinted]], *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._tell = tell
+        self._clock = clock
+        self._told: dict[str, dict[tuple[str, str], _Told]] = {}
+        self._sending: set[asyncio.Task[None]] = set()
+
+    def update(self, task: str, wanted: Mapping[tuple[str, str], PoolHint]) -> None:
+        """Tell what has changed since the last time; nothing is waited for. An empty mapping takes all back."""
+        now = self._clock()
+        told = self._told.setdefault(task, {})
+        for key in [key for key in told if key not in wanted]:
+            if told.pop(key).until > now:
+                self._send(key[0], PoolHint(image=key[1], count=0, task=task))
+        for key, hint in wanted.items():
+            before = told.get(key)
+            if before is not None and _same(before, hint, now):
+                continue
+            if self._send(key[0], hint):
+                told[key] = _Told(hint.count, now + hint.in_s, now, now + hint.in_s + hint.keep_s)
+        if not told:
+            del self._told[task]
+
+    def _send(self, gateway: str, hint: PoolHint) -> bool:
+        if len(self._sending) >= MOST_AT_ONCE:
+            return False
+        task = asyncio.create_task(self._carry(gateway, hint), name=f"hint to {gateway}")
+        self._sending.add(task)
+        task.add_done_callback(self._sending.discard)
+        return True
+
+    async def _carry(self, gateway: str, hint: PoolHint) -> None:
+        try:
+            async with asyncio.timeout(TELL_S):
+                answer = await self._tell(gateway, hint)
+        except (SwiftbotError, TimeoutError) as error:
+            log.debug("a hint was not heard", gateway=gateway, image=hint.image, reason=str(error))
+        else:
+            if not answer.taken:
+                log.debug("a hint is not followed", gateway=gateway, image=hint.image, reason=answer.why)
+
+    def close(self) -> None:
+        """Tell nothing more."""
+        for task in self._sending:
+            task.cancel()
+
+
+def _same(before: _Told, hint: PoolHint, now: float) -> bool:
+    moved = abs(before.at - (now + hint.in_s))
+    return (
+        before.count == hint.count
+        and moved <= max(SAME_S, 0.2 * hint.in_s)
+        and now - before.told_at < AGAIN_S
+    )  # fmt: skip
+
 
 MOST_AHEAD = 16
 """Subtasks of one task that pools are told of, those expected first."""

@@ -24,9 +24,8 @@ from appliance.model import (
     TaskRecord,
 )
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.migration.api import Held, HoldAsk
-from appliance.tasks.surroundings import Input, MoveReady, RunNews, Surroundings, deadline_s, need_of
+from appliance.tasks.api import Held, HoldAsk, RunAsk, RunStatus
+from appliance.tasks.context import Input, MoveReady, RunNews, Surroundings, deadline_s, need_of
 
 log = structlog.get_logger(__name__)
 

@@ -1,32 +1,210 @@
-"""Forgets what nobody will ask for again: old finished tasks, and what is left over of tasks.
+"""Retention: forgets what nobody will ask for again, old finished tasks and what is left over of tasks.
 
-Of an old finished task the id and the outcome stay for days (`remembering`), so that it is not done a second time when
-the id is handed in again; then they go too. What is left over are the effects of tasks that were trimmed or forgotten,
-and the checkpoints of tasks that have ended.
+A finished record is kept whole while it is among the newest (`tasks.keep_finished`); then it is replaced in place by a
+small one without plan, subtasks and results (a tombstone), under the same key and version history, so that at no moment
+the id is free: it is never done again, and whoever hands it in again gets the outcome. Tombstones go after
+`tasks.remember_days`, or sooner, the oldest first, where there are more than `tasks.remember_most`. What is left over
+are the effects of tasks that were trimmed or forgotten, and the checkpoints of tasks that have ended.
 
 Each gateway looks only at the records it owns, so nothing is removed twice and nobody is in charge. A removed task
-is still in the logs.
+is still in the logs; `LogFiles` knows from what recorders have told which files were being written when.
 """
 
 import asyncio
 import contextlib
+import hashlib
 import time
+from collections.abc import Collection, Iterable
+from datetime import UTC, datetime
+from typing import NamedTuple
 
 import msgspec
 import structlog
+from msgspec import Struct
+from msgspec.structs import replace
 
-from appliance.errors import ConflictError, PayloadError, SwiftbotError, UnreachableError
-from appliance.model import TaskRecord, encode
-from appliance.plane.dht import Record
+from appliance.errors import ConflictError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.model import Plan, Remembered, TaskRecord, TaskRequest, encode
+from appliance.plane.dht import LeaveOut, Record
 from appliance.plane.node import Plane
 from appliance.record.models import RecorderStatus
-from appliance.tasks import checkpoints
-from appliance.tasks.bounds import read_record
-from appliance.tasks.recorded import LogFiles, Span
-from appliance.tasks.remembering import Kept, due, may_trim, trimmed
+from appliance.tasks import checkpoints, enquiries
+from appliance.tasks.conflicts import unsettled
+from appliance.tasks.context import PREFIX, task_key
+from appliance.tasks.records import MAX_NOTE, clean, read_record
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.steering import enquiries
-from appliance.tasks.surroundings import PREFIX, task_key
+
+MAX_INSTRUCTION = 80
+"""Characters of the instruction that stay, to recognise the task by."""
+TRIMMED = LeaveOut(has=b'"remembered":{', lacks=b'"plan":')
+"""What tells a tombstone as it is stored from a whole record, without decoding it.
+
+Within a JSON text quotes are escaped, so that the mark can only be a field's name: this one, or a parameter's, which
+only a record with a plan has.
+"""
+_DAY_NS = 86_400 * 10**9
+
+
+class Kept(NamedTuple):
+    """A finished task's record, of one gateway's shard."""
+
+    key: str
+    ended_ns: int
+    """Unix nanoseconds, on the clock of whoever coordinated it."""
+    trimmed: bool
+    """Whether it is a tombstone already."""
+
+
+class Due(NamedTuple):
+    """What is to be done, by key."""
+
+    trim: tuple[str, ...]
+    forget: tuple[str, ...]
+    early: frozenset[str]
+    """Those of `forget` whose time is not over: there are more than may be remembered."""
+
+
+def due(kept: Collection[Kept], *, now_ns: int, keep: int, days: float, most: int) -> Due:
+    """Return which finished tasks are to be trimmed, and which to be forgotten for good.
+
+    Args:
+        kept: all finished records of the shard.
+        now_ns: Unix nanoseconds.
+        keep: how many stay whole, the newest.
+        days: how long after its end an id is remembered; 0: not at all.
+        most: how many tombstones there may be; the oldest beyond it are forgotten.
+    """
+    whole = sorted((each for each in kept if not each.trimmed), key=_newest)
+    surplus = whole[max(0, keep) :]
+    small = sorted((*surplus, *(each for each in kept if each.trimmed)), key=_newest)
+    since_ns = now_ns - int(days * _DAY_NS)
+    fresh = [each for each in small if days > 0 and each.ended_ns >= since_ns]
+    stay = {each.key for each in fresh[: max(0, most)]}
+    early = frozenset(each.key for each in fresh[max(0, most) :])
+    return Due(
+        trim=tuple(each.key for each in surplus if each.key in stay),
+        forget=tuple(each.key for each in small if each.key not in stay),
+        early=early,
+    )
+
+
+def _newest(each: Kept) -> tuple[int, str]:
+    return (-each.ended_ns, each.key)
+
+
+def may_trim(record: TaskRecord) -> bool:
+    """Whether nothing is left to be done about a record: it has ended, and what a partition left of it is settled."""
+    return record.state.final and not unsettled(record)
+
+
+def trimmed(record: TaskRecord, log: str) -> TaskRecord:
+    """Return the tombstone of a finished task; `log`: names of the log files of its time, empty where none is known.
+
+    The same from whichever gateway makes it, but for the log's name: copies that meet are resolved like any records.
+    """
+    failure = record.failure
+    return TaskRecord(
+        id=record.id,
+        instruction=clean(record.instruction, MAX_INSTRUCTION),
+        submitter=record.submitter,
+        priority=record.priority,
+        state=record.state,
+        failure=None if failure is None else replace(failure, message=clean(failure.message, MAX_NOTE)),
+        cancelled_by=record.cancelled_by,
+        coordinator=record.coordinator,
+        created_ns=record.created_ns,
+        updated_ns=record.updated_ns,
+        sequence=record.sequence,
+        remembered=Remembered(log=log, request=_digest_of(record)),
+    )
+
+
+def digest(instruction: str, group: Collection[str], plan: Plan | None) -> str:
+    """Return 16 hexadecimal digits by which a request is recognised: its text, gateways, and the plan it brought."""
+    steps = [(each.id, each.skill, each.params) for each in plan.subtasks] if plan is not None else None
+    return hashlib.sha256(encode([instruction, sorted(group), steps])).hexdigest()[:16]
+
+
+def _digest_of(record: TaskRecord) -> str:
+    """The digest of the request a record was made for; empty where its plan is another one by now."""
+    edited = record.revised > 0 or (record.decision is not None and record.decision.edited)
+    if record.handed_in and edited:
+        return ""
+    return digest(record.instruction, record.within, record.plan if record.handed_in else None)
+
+
+def answered(record: TaskRecord, request: TaskRequest) -> TaskRecord:
+    """Return what a request is answered whose id is known; a note says where that was of another request."""
+    if record.remembered is None or not record.remembered.request:
+        return record
+    if record.remembered.request == digest(request.instruction, request.group, request.plan):
+        return record
+    note = (
+        f"nothing was begun: task {record.id} was another request ({record.instruction!r}); hand this one in under an "
+        "id of its own"
+    )
+    return replace(record, note=clean(note, MAX_NOTE))
+
+
+def refuse_trimmed(record: TaskRecord) -> None:
+    """Raise RefusedError for a task of which only the outcome is known: there is nothing to try again."""
+    if record.remembered is not None:
+        raise RefusedError(f"task {record.id}: {done_text(record)}; its plan is not kept", remedy="submit it anew")
+
+
+def done_text(record: TaskRecord) -> str:
+    """When a trimmed task was done, what came of it, and where its details are; empty for any other."""
+    if record.remembered is None:
+        return ""
+    at = datetime.fromtimestamp(record.updated_ns / 1e9, tz=UTC)
+    where = f"the log {record.remembered.log}" if record.remembered.log else "the logs of that day, if any were kept"
+    return f"done on {at:%Y-%m-%d %H:%M:%S} UTC ({record.state}), details are in {where}"
+
+
+MOST_FILES = 500
+"""Files remembered; with a new one each half hour, ten days of one recorder."""
+MOST_NAMED = 3
+SLACK_NS = 5 * 10**9
+"""A recorder tells of itself once a second, and clocks of gateways differ a little."""
+
+
+class Span(Struct, kw_only=True):
+    """A file and the time in which its recorder said that it writes to it; Unix nanoseconds."""
+
+    recorder: str
+    file: str
+    since_ns: int
+    until_ns: int
+
+
+class LogFiles:
+    """The files of a fleet's recorders, as far as they were heard of."""
+
+    def __init__(self, spans: Iterable[Span] = ()) -> None:
+        self.spans = list(spans)[-MOST_FILES:]
+        """In the order in which they were begun."""
+
+    def heard(self, recorder: str, file: str, now_ns: int) -> None:
+        """Take in what a recorder tells; `file`: the one it writes to, empty when it writes to none."""
+        if not file:
+            return
+        for span in reversed(self.spans):
+            if span.recorder == recorder:
+                if span.file == file:
+                    span.until_ns = max(span.until_ns, now_ns)
+                    return
+                break
+        self.spans.append(Span(recorder=recorder, file=file, since_ns=now_ns, until_ns=now_ns))
+        del self.spans[:-MOST_FILES]
+
+    def at(self, when_ns: int) -> str:
+        """Return the names of the files written to at a time, by recorder, at most 3; empty where none is known."""
+        found: dict[str, str] = {}
+        for span in self.spans:
+            if span.since_ns - SLACK_NS <= when_ns <= span.until_ns + SLACK_NS:
+                found[span.recorder] = span.file
+        return ", ".join(found[recorder] for recorder in sorted(found)[:MOST_NAMED])
+
 
 log = structlog.get_logger(__name__)
 

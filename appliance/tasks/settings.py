@@ -1,13 +1,86 @@
-"""Configuration of the task manager."""
+"""Configuration of the task manager: scheduling, migration (section `[tasks.migration]`) and replanning."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
 from appliance.model import Approval
-from appliance.tasks.detection import DetectionConfig
-from appliance.tasks.migration.settings import MigrationConfig
-from appliance.tasks.replan.settings import ReplanConfig
+from appliance.tasks.durations import DetectionConfig
+
+Positive = Annotated[float, Meta(gt=0)]
+Part = Annotated[float, Meta(ge=0, le=1)]
+
+
+class MigrationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Marks, pauses, rations and weights (algorithms: migration)."""
+
+    overload: bool = True
+    """Whether an overloaded gateway has runs moved away by itself; drains and operators may in any case."""
+    every_s: Positive = 0.5
+    """How often a gateway looks at its own load."""
+    above_s: Annotated[float, Meta(ge=0)] = 3.0
+    """How long a mark must be exceeded before the gateway counts as overloaded: peaks pass by themselves."""
+    cpu_high: Part = 0.95
+    """Part of its processors from which a gateway is overloaded; 0: not looked at, where gateways share a machine."""
+    cpu_low: Part = 0.75
+    """Below this it is no longer, and only a gateway below this is given runs."""
+    queue_high: Annotated[int, Meta(ge=0)] = 1
+    """Runs waiting for a container from which a gateway is overloaded; 0: not looked at."""
+    settle_s: Positive = 10.0
+    """For so long a gateway that received a run gives none away, and one that gave some away is given none: what was
+    moved must show in the figures before they are gone by again."""
+    rest_s: Positive = 60.0
+    """For so long a run that was moved is not moved again by overload."""
+    max_moves: Annotated[int, Meta(ge=0)] = 3
+    """How often a subtask is moved by overload at most."""
+    moves_per_s: Positive = 4.0
+    """Runs that one gateway gives away, or takes, per second."""
+    fleet_moves_per_s: Positive = 40.0
+    """The same for the whole fleet: overloaded gateways share it."""
+    at_once: Annotated[int, Meta(ge=1)] = 4
+    """Moves away from one gateway under way at the same time by overload; twice as many when it drains."""
+    nearly_done_s: Annotated[float, Meta(ge=0)] = 2.0
+    """A run expected to end sooner than this is left where it is: the move would take longer."""
+    checkpoint_wait_s: Positive = 1.5
+    """How long a handler is given to save a fresh checkpoint before it is moved from the last one."""
+    command_wait_s: Annotated[float, Meta(ge=0)] = 2.0
+    """How long the end of a robot command is waited for, of a run that moves between commands only."""
+    hold_s: Positive = 10.0
+    """How long a run that is to be moved sends no robot commands; then it goes on where it is."""
+    warm_weight: float = 0.4
+    """Closest node: weight of a ready container of the image."""
+    load_weight: float = 0.3
+    """Closest node: weight of idle capacity."""
+    near_weight: float = 0.2
+    """Closest node: weight of holding the subtask's data, or its robot's link."""
+    history_weight: float = 0.1
+    """Closest node: weight of how earlier moves there went."""
+
+
+class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What may be done about a subtask that was given up, and how often."""
+
+    robots: Literal["any", "all", "never"] = "any"
+    """Which robots another may stand in for: those that the appliance chose itself (`any`), those that the operator
+    named too (`all`), or none (`never`). Whoever names a robot usually means it."""
+    robot_wait_s: float = 15.0
+    """How long a robot that went offline is waited for before another takes over: a link that blinks, or a gateway
+    that restarts, is back within seconds."""
+    min_battery_percent: float = 20.0
+    """A robot that tells less does not stand in for another: it would be the next to fail."""
+    skills: bool = True
+    """Whether alternatives that manifests declare may be used."""
+    decompose: bool = True
+    """Whether the decomposer may plan anew what is left. Never for a plan that was written by hand and came with its
+    task."""
+    max_replans: int = 2
+    """New plans of the decomposer for one task; if two did not help, a person should look."""
+    max_revisions: int = 6
+    """All revisions of one task's plan."""
+    confirm_s: float = 600.0
+    """How long it waits; then the task fails."""
+    ask_s: float = 90.0
+    """How long the decomposer may take, all its tiers together."""
 
 
 class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -24,7 +24,7 @@ from appliance.pool.api import Evicted, WarmAsk
 from appliance.reasons import why_text
 from appliance.steering import cancel_outcome
 from appliance.stopping import unknown_text
-from appliance.tasks.migration.api import MigrateAsk
+from appliance.tasks.api import MigrateAsk
 from appliance.tui.formatting import counted, time_of_day
 from appliance.tui.safe import safe
 

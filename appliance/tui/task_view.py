@@ -11,7 +11,7 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance.model import PLAIN_PRIORITY, Proposal, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.tasks.why import AttemptWhy, SubtaskWhy, TaskWhy, Waits
+from appliance.tasks.views import AttemptWhy, SubtaskWhy, TaskWhy, Waits
 from appliance.tui import plan_editor, status_styles
 from appliance.tui.formatting import Cell, bar, clock, duration, hanging, milliseconds, told
 from appliance.tui.plan_editor import params_text

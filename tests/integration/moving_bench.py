@@ -20,8 +20,7 @@ from appliance.fleet_state import FleetState
 from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.migration.settings import MigrationConfig
-from appliance.tasks.settings import TasksConfig
+from appliance.tasks.settings import MigrationConfig, TasksConfig
 from workshop import local_fleet
 from workshop.local_fleet import Order
 

@@ -24,9 +24,8 @@ from appliance.fleet_state import FleetState
 from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, RevisionKind, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.replan.settings import ReplanConfig
 from appliance.tasks.replay import replay
-from appliance.tasks.settings import TasksConfig
+from appliance.tasks.settings import ReplanConfig, TasksConfig
 from workshop import local_fleet
 from workshop.local_fleet import Order
 

@@ -21,8 +21,8 @@ from appliance.model import (
     TaskState,
     Tier,
 )
-from appliance.tasks.recovery import rest_of
-from appliance.tasks.replan.splice import problems
+from appliance.tasks.plans import rest_of
+from appliance.tasks.replan import problems
 
 pytestmark = pytest.mark.anyio
 

@@ -18,9 +18,9 @@ from appliance.fleet_state import FleetState
 from appliance.model import Plan, RobotCommand, Subtask, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig, PressureConfig
 from appliance.record.reader import read
-from appliance.tasks.migration.api import MigrateAsk, MigrationRequest
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.api import MigrateAsk, MigrationRequest
 from appliance.tasks.replay import replay
+from appliance.tasks.settings import MigrationConfig
 from workshop import local_fleet
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]

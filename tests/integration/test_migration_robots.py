@@ -15,9 +15,9 @@ from appliance.fleet_state import FleetState
 from appliance.model import Plan, RobotCommand, Subtask, SubtaskRecord, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
-from appliance.tasks.migration.api import MigrateAsk
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.api import MigrateAsk
 from appliance.tasks.replay import replay
+from appliance.tasks.settings import MigrationConfig
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(400)]
 

@@ -28,8 +28,7 @@ from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
 from appliance.tasks.api import TaskAsk
-from appliance.tasks.migration.settings import MigrationConfig
-from appliance.tasks.settings import TasksConfig
+from appliance.tasks.settings import MigrationConfig, TasksConfig
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(600)]
 

@@ -21,7 +21,7 @@ from appliance.client import FleetClient
 from appliance.fleet_state import FleetState
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.replan.settings import ReplanConfig
+from appliance.tasks.settings import ReplanConfig
 from workshop import local_fleet
 from workshop.local_fleet import Order
 

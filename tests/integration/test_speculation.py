@@ -19,7 +19,7 @@ from appliance.fleet_state import FleetState
 from appliance.model import Notice, Plan, RobotCommand, Subtask, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read
-from appliance.tasks.detection import DetectionConfig
+from appliance.tasks.durations import DetectionConfig
 from appliance.tasks.replay import replay
 from appliance.tasks.settings import TasksConfig
 from workshop import local_fleet

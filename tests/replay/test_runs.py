@@ -16,7 +16,7 @@ from appliance.model import ContainerInfo, ContainerState, TaskRecord
 from appliance.plane.keys import Keys
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
-from appliance.tasks.check import CheckReport, check
+from appliance.tasks.replay import CheckReport, check
 from appliance.tui.store import Store
 from appliance.tui.subscriptions import Hearing
 

@@ -27,8 +27,7 @@ from appliance.model import (
 )
 from appliance.robots.api import StopAnswer
 from appliance.stopping import Named, named
-from appliance.tasks.api import PlanAnswer
-from appliance.tasks.steering.api import PlanChecked
+from appliance.tasks.api import PlanAnswer, PlanChecked
 
 ROSTER = ("rover_1", "rover_2", "drone_1")
 PLAN = Plan(domain="inspection", subtasks=(Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock"}),))

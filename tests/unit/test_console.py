@@ -24,8 +24,7 @@ from appliance.model import (
 )
 from appliance.pool.api import Evicted, PoolDecision
 from appliance.reasons import why_text
-from appliance.tasks.view import view
-from appliance.tasks.why import TaskWhy, why
+from appliance.tasks.views import TaskWhy, view, why
 
 CHOICE = Choice(
     phase=Phase.REMOTE_WARM,

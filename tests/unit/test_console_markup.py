@@ -39,8 +39,8 @@ from appliance.records import Held
 from appliance.robots.api import LinkList, StopAnswer
 from appliance.stopping import Stopped
 from appliance.tasks.api import ExperienceList, PlanAnswer
-from appliance.tasks.watch.lines import Line
-from appliance.tasks.why import TaskWhy
+from appliance.tasks.lines import Line
+from appliance.tasks.views import TaskWhy
 
 CRASHES = '[/red] x" [bold]b[/] [link=x] [/] \\[a] :warning: [@click=f]'
 

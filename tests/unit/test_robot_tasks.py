@@ -11,9 +11,8 @@ from appliance.llm.safety.settings import SafetyConfig
 from appliance.model import Plan, RobotInfo, Subtask, TaskRecord, TaskRequest
 from appliance.plane.node import Plane
 from appliance.robot_tasks import MOST_HANDED_IN, RobotTasks
-from appliance.tasks.api import TaskAsk
+from appliance.tasks.api import CancelTaskAsk, TaskAsk
 from appliance.tasks.manager import TaskManager
-from appliance.tasks.steering.api import CancelTaskAsk
 
 pytestmark = pytest.mark.anyio
 

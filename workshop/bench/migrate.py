@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from appliance.client import FleetClient
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.migration.api import MigrateAsk
+from appliance.tasks.api import MigrateAsk
 from workshop.bench import overload
 from workshop.bench.figures import ratio, summary
 from workshop.bench.moving import GATEWAYS, SKILL, STATEFUL, Progress, ended, fleet, running, task_of

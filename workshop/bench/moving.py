@@ -13,8 +13,7 @@ from appliance.errors import PoolError, SwiftbotError
 from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.migration.settings import MigrationConfig
-from appliance.tasks.settings import TasksConfig
+from appliance.tasks.settings import MigrationConfig, TasksConfig
 from workshop import local_fleet
 from workshop.bench.pooled import fleet_name, write_skill
 from workshop.local_fleet import Order

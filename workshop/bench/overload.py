@@ -22,7 +22,7 @@ from appliance.client import FleetClient
 from appliance.errors import DeadlineError, PoolError
 from appliance.model import RunEvent, RunEventKind, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.settings import MigrationConfig
 from workshop.bench.figures import ratio, summary
 from workshop.bench.moving import PATIENCE_S, SKILL, Progress, fleet, task_of
 

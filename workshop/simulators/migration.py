@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from appliance.model import GatewayStatus, Need
-from appliance.tasks.migration.budget import Bucket
-from appliance.tasks.migration.closest import History, Place, closest
-from appliance.tasks.migration.overload import Candidate, Load, Overload, Room
-from appliance.tasks.migration.settings import MigrationConfig
-from appliance.tasks.migration.shedding import free_places
+from appliance.tasks.migration.gateway import free_places
+from appliance.tasks.migration.policy import Bucket, Candidate, History, Load, Overload, Place, Room, closest
+from appliance.tasks.settings import MigrationConfig
 
 STEP_S = 0.1
 STATUS_S = 1.0

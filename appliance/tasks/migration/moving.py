@@ -33,9 +33,7 @@ from appliance.model import RunRequest, SubtaskRecord, SubtaskState, TaskRecord
 from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.bounds import MAX_NOTE, clean
-from appliance.tasks.migration.api import (
+from appliance.tasks.api import (
     Held,
     HoldAsk,
     MigrateAsk,
@@ -44,13 +42,16 @@ from appliance.tasks.migration.api import (
     MoveCancelled,
     Reason,
     Reserved,
+    RunAsk,
+    RunStatus,
     Weighed,
 )
-from appliance.tasks.migration.closest import History, Place, closest
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.context import Input, MoveReady, task_key
+from appliance.tasks.migration.policy import History, Place, closest
 from appliance.tasks.orders import request_for
 from appliance.tasks.placement import holds
-from appliance.tasks.surroundings import Input, MoveReady, task_key
+from appliance.tasks.records import MAX_NOTE, clean
+from appliance.tasks.settings import MigrationConfig
 
 log = structlog.get_logger(__name__)
 

@@ -15,8 +15,8 @@ from textual.widgets import Static
 
 from appliance.errors import SwiftbotError
 from appliance.model import SubtaskState, TaskRecord
-from appliance.tasks.watch.lines import Line
-from appliance.tasks.why import TaskWhy, why
+from appliance.tasks.lines import Line
+from appliance.tasks.views import TaskWhy, why
 from appliance.tui import status_styles, task_view
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen

@@ -32,8 +32,7 @@ from appliance.model.open_enum import enums_open
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.tasks.api import PlanAnswer, PlanAsk, TaskList, TasksAsk
-from appliance.tasks.steering.api import CancelTaskAsk
+from appliance.tasks.api import CancelTaskAsk, PlanAnswer, PlanAsk, TaskList, TasksAsk
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.settings import TuiConfig
 from appliance.tui.subscriptions import FleetView

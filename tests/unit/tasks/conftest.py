@@ -15,10 +15,10 @@ import pytest
 
 from appliance.model import RunEventKind, RunRequest, TaskRecord, encode
 from appliance.skills.catalogue import Catalogue
-from appliance.tasks.driver import Driver
+from appliance.tasks.context import Input, RunNews, Steered, task_key
+from appliance.tasks.coordinator import Driver
 from appliance.tasks.machine import Transition
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.surroundings import Input, RunNews, Steered, task_key
 from tests.unit.tasks.fake_plane import FakePlane
 from tests.unit.tasks.fake_pool import FakePool
 from tests.unit.tasks.fake_surroundings import FAST, FakeSurroundings

@@ -19,12 +19,11 @@ from appliance.model import (
 )
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.checkpoints import Checkpoint
-from appliance.tasks.line import Place
+from appliance.tasks.context import FREE
 from appliance.tasks.machine import Transition
-from appliance.tasks.placement import Placement
-from appliance.tasks.replan.robots import Robots
+from appliance.tasks.placement import Place, Placement
+from appliance.tasks.replan import Robots
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.surroundings import FREE
 from tests.unit.tasks.fake_plane import FakePlane
 from tests.unit.tasks.sample_records import manifest, plan_of
 

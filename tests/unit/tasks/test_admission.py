@@ -12,8 +12,8 @@ from msgspec.structs import replace
 from appliance.model import Group, Plan, RunEventKind, Subtask, TaskRecord, TaskState, encode
 from appliance.plane.session import Message
 from appliance.tasks.admission import LONGEST_RETRY_S, Ends, expectation, full, longest_s
-from appliance.tasks.deadline import Ages, left_s
 from appliance.tasks.machine import TransitionKind
+from appliance.tasks.timing import Ages, left_s
 
 pytestmark = pytest.mark.anyio
 

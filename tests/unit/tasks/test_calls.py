@@ -10,9 +10,9 @@ from msgspec.structs import replace
 from appliance.errors import PayloadError, RefusedError, RobotError
 from appliance.model import Failure, Need, Notice, RobotCommand, RobotInfo, RobotReply, RunRequest, encode
 from appliance.pool.pool import Call
-from appliance.tasks import calls as module
+from appliance.tasks import handler_calls as module
 from appliance.tasks.artifacts import Artifacts
-from appliance.tasks.calls import Calls
+from appliance.tasks.handler_calls import Calls
 
 pytestmark = pytest.mark.anyio
 

@@ -31,10 +31,9 @@ from appliance.pool.policies import Idle
 from appliance.pool.selection import Candidate, Facts, select
 from appliance.pool.settings import PoolConfig
 from appliance.tasks import machine
-from appliance.tasks.check import check
-from appliance.tasks.decided import Asked, placement_case
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.placement import place
+from appliance.tasks.placement import Asked, place, placement_case
+from appliance.tasks.replay import check
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.transition import fingerprint
 

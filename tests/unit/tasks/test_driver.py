@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from appliance.errors import DeadlineError, PlanError, RefusedError, UnreachableError
 from appliance.model import Failure, RunEvent, RunEventKind, Subtask, SubtaskState, TaskState, encode
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.surroundings import CancelAsked, GatewayLost, Wake, task_key
+from appliance.tasks.context import CancelAsked, GatewayLost, Wake, task_key
 
 pytestmark = pytest.mark.anyio
 

@@ -25,9 +25,8 @@ from appliance.model import (
 )
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.elsewhere import Offer, choose
 from appliance.tasks.executor import Executor
-from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
+from appliance.tasks.offload import Offer, RemoteContainers, UnmeasuredLinks, choose
 
 pytestmark = pytest.mark.anyio
 

@@ -36,9 +36,9 @@ from appliance.model import (
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.checkpoints import read_checkpoint
+from appliance.tasks.context import task_key
 from appliance.tasks.executor import Executor
-from appliance.tasks.remote import RemoteContainers, UnmeasuredLinks
-from appliance.tasks.surroundings import task_key
+from appliance.tasks.offload import RemoteContainers, UnmeasuredLinks
 
 pytestmark = pytest.mark.anyio
 
@@ -332,7 +332,7 @@ async def test_a_gateway_whose_offers_are_nothing_again_and_again_is_left_out(
     executor: Executor, plane: Any, pool: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three in a row, and it is not asked for a while; a good one in between begins anew."""
-    monkeypatch.setattr("appliance.tasks.remote.FIRST_LEFT_OUT_S", 10.0)  # or a slow machine is too late to see it
+    monkeypatch.setattr("appliance.tasks.offload.FIRST_LEFT_OUT_S", 10.0)  # or a slow machine is too late to see it
     refuse = True
 
     async def answer(gateway: str, request: RunRequest) -> RunAccepted:

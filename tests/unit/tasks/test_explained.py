@@ -21,10 +21,10 @@ from appliance.model import (
     Way,
     encode,
 )
-from appliance.tasks import machine, orders, partials
+from appliance.tasks import coordinator, machine, orders
 from appliance.tasks.checkpoints import Checkpoint
+from appliance.tasks.coordinator import MAX_PARTIAL_BYTES, Partials, shown
 from appliance.tasks.machine import KEPT_CHOICES, Transition, TransitionKind
-from appliance.tasks.partials import MAX_PARTIAL_BYTES, Partials, shown
 
 pytestmark = pytest.mark.anyio
 
@@ -105,7 +105,7 @@ async def test_the_last_partial_result_is_shown_until_there_is_a_result(
     bench: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Many partial results are few transitions; the newest stands; the result takes its place."""
-    monkeypatch.setattr(partials, "EVERY_S", 0.05)
+    monkeypatch.setattr(coordinator, "EVERY_S", 0.05)
     await bench.start()
     _, request = await bench.ordered()
     for number in range(100):

@@ -25,11 +25,10 @@ from appliance.model import (
 )
 from appliance.plane.dht import Record
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.healing import foreign, heal
-from appliance.tasks.keeper import Keeper, SupersededError
+from appliance.tasks.conflicts import foreign, heal, merged, split_of
+from appliance.tasks.context import RunNews, task_key
 from appliance.tasks.machine import apply
-from appliance.tasks.resolve import merged, split_of
-from appliance.tasks.surroundings import RunNews, task_key
+from appliance.tasks.record_writer import Keeper, SupersededError
 from appliance.tasks.transition import Transition, TransitionKind
 
 pytestmark = pytest.mark.anyio

@@ -11,7 +11,7 @@ from appliance.errors import UnreachableError
 from appliance.model import Need, Plan, PoolHint, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
 from appliance.pool.api import Hinted
 from appliance.tasks.durations import DEFAULT_S, WINDOW, Durations
-from appliance.tasks.hints import AGAIN_S, HORIZON_S, MOST_AT_ONCE, MOST_KEEP_S, Hinting, expected_starts, hints
+from appliance.tasks.lookahead import AGAIN_S, HORIZON_S, MOST_AT_ONCE, MOST_KEEP_S, Hinting, expected_starts, hints
 
 pytestmark = pytest.mark.anyio
 

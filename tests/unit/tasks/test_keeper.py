@@ -11,8 +11,8 @@ from appliance.model import Plan, Subtask, encode
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.tasks import machine
-from appliance.tasks.keeper import Keeper, SupersededError
 from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.record_writer import Keeper, SupersededError
 
 
 def test_a_run_of_this_gateway_unsettles_until_its_end_is_written() -> None:

@@ -4,8 +4,8 @@ import pytest
 
 from appliance.errors import RefusedError
 from appliance.model import Need, RunEvent, RunEventKind, RunRequest, encode
-from appliance.tasks import kept_runs
-from appliance.tasks.kept_runs import KeptRuns
+from appliance.tasks import executor
+from appliance.tasks.executor import KeptRuns
 from tests.unit.tasks.fake_plane import FakeStore
 from tests.unit.tasks.sample_records import event
 
@@ -20,7 +20,7 @@ def told(task: str, attempt: int = 1, kind: RunEventKind = RunEventKind.SUCCEEDE
 
 async def test_of_too_many_runs_the_oldest_go(monkeypatch: pytest.MonkeyPatch) -> None:
     """What nobody asked after goes, in memory and on the disk; a run in progress stays however old it is."""
-    monkeypatch.setattr(kept_runs, "KEPT_RUNS", 2)
+    monkeypatch.setattr(executor, "KEPT_RUNS", 2)
     store = FakeStore()
     kept = KeptRuns(store, "gw-1")
     for task in ("t-1", "t-2"):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.model import GatewayStatus, Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.tasks.line import Line, Place
+from appliance.tasks.placement import Line, Place
 
 
 def task(name: str, **fields: Any) -> TaskRecord:

@@ -39,16 +39,15 @@ from appliance.model.tasks import LostRun
 from appliance.plane.dht import Record
 from appliance.pool.api import Hinted
 from appliance.skills.catalogue import load_catalogue
-from appliance.tasks import driving as module
 from appliance.tasks import machine
-from appliance.tasks.api import TaskAsk, TasksAsk, WhyAsk
-from appliance.tasks.bounds import read_record
+from appliance.tasks import manager as module
+from appliance.tasks.api import CancelTaskAsk, RetryAsk, TaskAsk, TasksAsk, WhyAsk
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
-from appliance.tasks.remembering import trimmed
+from appliance.tasks.records import read_record
+from appliance.tasks.retention import trimmed
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.steering.api import CancelTaskAsk, RetryAsk
 
 pytestmark = pytest.mark.anyio
 

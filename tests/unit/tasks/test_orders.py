@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.model import Need, RunRequest, SubtaskRecord
+from appliance.tasks.context import MoveReady
 from appliance.tasks.orders import Orders
-from appliance.tasks.surroundings import MoveReady
 
 OLD = RunRequest(task="t-1", subtask="s1", attempt=1, skill="work", need=Need(image="base"))
 NEW = RunRequest(task="t-1", subtask="s1", attempt=2, skill="work", need=Need(image="base"))

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.tasks.recorded import MOST_FILES, SLACK_NS, LogFiles
+from appliance.tasks.retention import MOST_FILES, SLACK_NS, LogFiles
 
 S = 10**9
 

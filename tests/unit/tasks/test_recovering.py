@@ -9,10 +9,9 @@ from msgspec.structs import replace
 
 from appliance.errors import PlanError
 from appliance.model import Failure, Plan, Provenance, RunEvent, RunEventKind, Subtask, SubtaskState, TaskState, Tier
-from appliance.tasks.api import RunStatus
-from appliance.tasks.replan.settings import ReplanConfig
-from appliance.tasks.steering.api import ApproveAsk, RejectAsk
-from appliance.tasks.surroundings import CancelAsked, RunNews
+from appliance.tasks.api import ApproveAsk, RejectAsk, RunStatus
+from appliance.tasks.context import CancelAsked, RunNews
+from appliance.tasks.settings import ReplanConfig
 
 pytestmark = pytest.mark.anyio
 

@@ -14,7 +14,7 @@ from appliance.model import Failure, Plan, RobotInfo, Site, Subtask, TaskRecord
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import machine
 from appliance.tasks.durations import Durations
-from appliance.tasks.recovery import Recovery
+from appliance.tasks.plans import Recovery
 from appliance.tasks.transition import Transition, TransitionKind
 
 pytestmark = pytest.mark.anyio

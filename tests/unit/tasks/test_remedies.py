@@ -14,9 +14,8 @@ import appliance
 from appliance.errors import NotFoundError, PlanError, RefusedError, SwiftbotError
 from appliance.model import Failure, RunEventKind, TaskRecord, TaskState
 from appliance.pool.runner.child import REASONS
-from appliance.tasks.keeper import Keeper
 from appliance.tasks.machine import TransitionKind
-from appliance.tasks.remedies import BY_CODE, remedied
+from appliance.tasks.record_writer import BY_CODE, Keeper, remedied
 from tests.unit.tasks.sample_records import accepted, plan_of
 
 pytestmark = pytest.mark.anyio

@@ -12,19 +12,11 @@ from appliance.errors import RefusedError
 from appliance.model import Failure, Plan, Split, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState, encode
 from appliance.plane.store import Store
 from appliance.plane.versions import Record
-from appliance.tasks.remembering import (
-    TRIMMED,
-    Kept,
-    answered,
-    done_text,
-    due,
-    may_trim,
-    trimmed,
-)
-from appliance.tasks.resolve import merged, stronger
-from appliance.tasks.steering.api import RetryAsk
-from appliance.tasks.steering.deciding import may_retry
-from appliance.tasks.why import why
+from appliance.tasks.api import RetryAsk
+from appliance.tasks.conflicts import merged, stronger
+from appliance.tasks.retention import TRIMMED, Kept, answered, done_text, due, may_trim, trimmed
+from appliance.tasks.steering import may_retry
+from appliance.tasks.views import why
 
 pytestmark = pytest.mark.anyio
 

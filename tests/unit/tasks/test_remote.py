@@ -7,7 +7,7 @@ import pytest
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, VolumeInfo
 from appliance.tasks.api import ContainerList
-from appliance.tasks.remote import (
+from appliance.tasks.offload import (
     BRING_MS,
     EMPTY_OFFERS,
     FIRST_LEFT_OUT_S,
@@ -30,7 +30,7 @@ def container(gateway: str, name: str, state: ContainerState = READY, **fields: 
 @pytest.fixture
 def remote(plane: Any, monkeypatch: pytest.MonkeyPatch) -> RemoteContainers:
     """Return what gw-1 knows of gw-2, gw-3 (asked) and gw-4 (heard of)."""
-    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", 3600.0)  # or a slow machine is too late to see a promise
+    monkeypatch.setattr("appliance.tasks.offload.PROMISED_S", 3600.0)  # or a slow machine is too late to see a promise
     plane.present = {"gw-1", "gw-2", "gw-3", "gw-4"}
     return RemoteContainers(plane, successors=3, links=UnmeasuredLinks())
 
@@ -156,8 +156,8 @@ async def test_what_a_gateway_has_that_may_not_be_used_ends_no_search(
     remote: RemoteContainers, plane: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither what is known of it saves asking, nor its answer, the first, waiting for one that can be used."""
-    monkeypatch.setattr("appliance.tasks.remote.PATIENCE", 0.0)
-    monkeypatch.setattr("appliance.tasks.remote.LEAST_PATIENCE_S", 0.0)
+    monkeypatch.setattr("appliance.tasks.offload.PATIENCE", 0.0)
+    monkeypatch.setattr("appliance.tasks.offload.LEAST_PATIENCE_S", 0.0)
     know(plane, container("gw-4", "known"))
     plane.registry.ages = {"gw-4": 0.1}
     whole = {"cpu": 8.0, "memory_mb": 8192, "volumes": NEED.volumes}
@@ -225,7 +225,7 @@ async def test_runs_that_were_sent_are_not_remembered_for_ever(
 ) -> None:
     """Those whose time is over go when the next one is sent, those of a lost gateway with it."""
     know(plane, container("gw-2", "a"))
-    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", -1.0)
+    monkeypatch.setattr("appliance.tasks.offload.PROMISED_S", -1.0)
     for number in range(5):
         remote.promise("gw-2", ("t1", f"s{number}"))
     assert [remote.waits_for(("t1", f"s{number}")) for number in range(5)] == [False] * 4 + [True]
@@ -264,9 +264,9 @@ async def test_an_answer_that_took_long_is_not_taken_for_another_runs(
     """A refusal frees what the refused run held, and a container is that of the run that got it, in whatever order."""
     know(plane, container("gw-2", "a"), container("gw-2", "b"), container("gw-2", "c"))
     plane.registry.ages = {"gw-2": 0.1}
-    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", -1.0)
+    monkeypatch.setattr("appliance.tasks.offload.PROMISED_S", -1.0)
     slow = [remote.promise("gw-2"), remote.promise("gw-2")]
-    monkeypatch.setattr("appliance.tasks.remote.PROMISED_S", 3600.0)
+    monkeypatch.setattr("appliance.tasks.offload.PROMISED_S", 3600.0)
     later = remote.promise("gw-2")
     remote.turned_out(slow[0], good=True, container="c")
     assert {each.id for each in remote.ready(NEED)} == {"b", "c"}, "whose answer is still to come holds one"

@@ -10,12 +10,11 @@ from msgspec.structs import replace
 
 from appliance.errors import RefusedError
 from appliance.model import Failure, RunEvent, RunEventKind, SubtaskState, TaskState, encode
-from appliance.tasks.api import RunStatus
+from appliance.tasks.api import DrainAsk, RunStatus
+from appliance.tasks.conflicts import foreign, heal
+from appliance.tasks.context import CancelAsked, GatewayLost
 from appliance.tasks.executor import Executor
-from appliance.tasks.healing import foreign, heal
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind, apply, gives_up
-from appliance.tasks.migration.api import DrainAsk
-from appliance.tasks.surroundings import CancelAsked, GatewayLost
 from tests.unit.tasks import test_executor
 from tests.unit.tasks.migration import test_draining, test_moving
 from tests.unit.tasks.migration.test_draining import Gateway, here

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from appliance.model import Attempt, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState, encode
 from appliance.plane.dht import Record
 from appliance.pool.lineage import VolumeRecord
-from appliance.tasks.resolve import MOST_SPLITS, merged, resolver, stronger
+from appliance.tasks.conflicts import MOST_SPLITS, merged, resolver, stronger
 
 
 def record(state: TaskState, done: int, sequence: int, coordinator: str) -> bytes:

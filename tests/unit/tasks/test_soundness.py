@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import Subtask, SubtaskRecord, TaskRecord
-from appliance.tasks.soundness import MOST_SUBTASKS, unsound
+from appliance.tasks.records import MOST_SUBTASKS, unsound
 
 
 def record(*subtasks: tuple[str, tuple[str, ...]], **params: Any) -> TaskRecord:

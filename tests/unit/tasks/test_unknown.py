@@ -27,8 +27,7 @@ from appliance.model import (
     encode,
 )  # fmt: skip
 from appliance.model.tasks import LostRun
-from appliance.tasks.bounds import read_record
-from appliance.tasks.unknown import unknown, with_unknown
+from appliance.tasks.records import read_record, unknown, with_unknown
 
 PLAN = Plan(domain="d", subtasks=(Subtask(id="a", skill="go"), Subtask(id="b", skill="go", after=("a",))))
 LOST = LostRun(subtask="a", attempt=1, gateway="gw-2", state=SubtaskState.RUNNING)

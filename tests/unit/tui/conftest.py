@@ -30,8 +30,8 @@ from appliance.model import (
     Tier,
 )
 from appliance.tasks.api import PlanAnswer
-from appliance.tasks.watch.lines import Line
-from appliance.tasks.why import TaskWhy, why
+from appliance.tasks.lines import Line
+from appliance.tasks.views import TaskWhy, why
 from appliance.tui.store import Connection, Store
 
 PLAN = Plan(

@@ -17,8 +17,8 @@ from appliance.model import Enquiry, SoftStop
 from appliance.pool.api import Evicted, Released, Warmed
 from appliance.pool.transfer.api import Brought
 from appliance.robots.api import StopAnswer
-from appliance.tasks.migration.api import DrainState, Migrated
-from appliance.tasks.why import TaskWhy
+from appliance.tasks.api import DrainState, Migrated
+from appliance.tasks.views import TaskWhy
 from appliance.tui import command_line, status_styles
 from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS, keymap
 from appliance.tui.app import SwiftbotApp

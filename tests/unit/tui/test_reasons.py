@@ -10,7 +10,7 @@ from appliance.cli import app
 from appliance.pool.api import Evicted, Released, Warmed
 from appliance.pool.transfer.api import Brought
 from appliance.robots.api import StopAnswer
-from appliance.tasks.migration.api import DrainState, Migrated
+from appliance.tasks.api import DrainState, Migrated
 from appliance.tui import command_line
 from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS
 

@@ -10,8 +10,8 @@ from textual.pilot import Pilot
 
 from appliance.errors import ConflictError
 from appliance.model import Decision, Plan, Proposal, Subtask, TaskRecord, TaskState
-from appliance.tasks.steering.api import PlanChecked
-from appliance.tasks.watch.lines import Line, LineKind
+from appliance.tasks.api import PlanChecked
+from appliance.tasks.lines import Line, LineKind
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.screens.tasks import TaskScreen

@@ -8,8 +8,8 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.model import Enquiry, Notice, Pose, RobotInfo, SoftStop
-from appliance.tasks.steering.api import PlanChecked
-from appliance.tasks.watch.lines import Line, LineKind
+from appliance.tasks.api import PlanChecked
+from appliance.tasks.lines import Line, LineKind
 from appliance.tui.replay import LogFile
 from appliance.tui.screens import replay as replay_screen
 

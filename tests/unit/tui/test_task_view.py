@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Failure, Plan, Proposal, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.tasks.why import CandidateWhy, SubtaskWhy, Waits
+from appliance.tasks.views import CandidateWhy, SubtaskWhy, Waits
 from appliance.tui.task_view import (
     brief,
     nodes,

@@ -10,8 +10,7 @@ from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
 from appliance.model import Approval, LogLine, Notice, TaskRecord, TaskRequest, TaskState
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
-from appliance.tasks.api import TaskAsk
-from appliance.tasks.steering.api import ApproveAsk, CancelTaskAsk
+from appliance.tasks.api import ApproveAsk, CancelTaskAsk, TaskAsk
 from workshop.bench.chaos import sides
 from workshop.bench.chaos.arena import Progress
 from workshop.bench.chaos.sides import APPROVE, CANCEL, SUBMIT, Agreement, Contested, Cut, Given, View

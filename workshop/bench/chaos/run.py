@@ -23,8 +23,8 @@ from appliance.model import LogLine, TaskRecord, TaskRequest
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.check import check
 from appliance.tasks.machine import Transition
+from appliance.tasks.replay import check
 from workshop.bench.chaos import account, plan
 from workshop.bench.chaos import sides as both_sides
 from workshop.bench.chaos.account import Down, Follower, Submitted

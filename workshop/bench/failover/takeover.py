@@ -29,8 +29,8 @@ from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.api import TaskAsk
+from appliance.tasks.context import task_key
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.surroundings import task_key
 from workshop.bench.chaos.arena import Arena, Progress, loopback
 from workshop.bench.failover.logs import LOOK_S, LogTail, wall_s
 from workshop.bench.figures import summary

@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.model import GatewayStatus, Need, RobotInfo
-from appliance.tasks.groups.capability import Want, image_holders, lacks, why_not
+from appliance.tasks.placement import Want, image_holders, lacks, why_not
 
 WANT = Want(subtask="s1", skill="look", need=Need(image="vision", cpu=2.0, memory_mb=512), image="localhost/vision:1")
 ABLE = GatewayStatus(id="gw-1", fleet="f", cores=4, pool_memory_mb=1024, images=("localhost/vision:1",))

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from appliance.model import Group
 from appliance.plane.ring import Ring
-from appliance.tasks.groups.formation import HYSTERESIS, Standing, Weights, form, must_form, root_of, score, without
+from appliance.tasks.placement import HYSTERESIS, Standing, Weights, form, must_form, root_of, score, without
 
 WEIGHTS = Weights()
 NAMES = tuple(f"gw-{number}" for number in range(1, 21))

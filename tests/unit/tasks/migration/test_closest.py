@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need
-from appliance.tasks.migration.api import Weighed
-from appliance.tasks.migration.closest import History, Place, closest
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.api import Weighed
+from appliance.tasks.migration.policy import History, Place, closest
+from appliance.tasks.settings import MigrationConfig
 
 NEED = Need(image="base")
 CONFIG = MigrationConfig()

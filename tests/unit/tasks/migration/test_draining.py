@@ -9,12 +9,11 @@ import pytest
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.model import Need, RunRequest
-from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.api import DrainAsk, DrainStateAsk, Reason, RunAsk, RunStatus, UndrainAsk
 from appliance.tasks.executor import Here
-from appliance.tasks.migration import draining as module
-from appliance.tasks.migration.api import DrainAsk, DrainStateAsk, Reason, UndrainAsk
-from appliance.tasks.migration.draining import Draining
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.migration import gateway as module
+from appliance.tasks.migration.gateway import Draining
+from appliance.tasks.settings import MigrationConfig
 
 pytestmark = pytest.mark.anyio
 

@@ -11,11 +11,10 @@ from appliance.errors import NotFoundError, RefusedError
 from appliance.model import Need, RunRequest
 from appliance.pool.pool import Call
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.api import RunAsk, RunStatus
+from appliance.tasks.api import HoldAsk, RunAsk, RunStatus
 from appliance.tasks.executor import Here
-from appliance.tasks.migration.api import HoldAsk
-from appliance.tasks.migration.leaving import Leaving
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.migration.handoff import Leaving
+from appliance.tasks.settings import MigrationConfig
 
 pytestmark = pytest.mark.anyio
 

@@ -26,11 +26,10 @@ from appliance.model import (
     SubtaskState,
     TaskState,
 )
-from appliance.tasks.api import RunStatus
+from appliance.tasks.api import Held, MigrateAsk, Migrated, MoveAsk, Reserved, RunStatus
 from appliance.tasks.migration import moving as module
-from appliance.tasks.migration.api import Held, MigrateAsk, Migrated, MoveAsk, Reserved
 from appliance.tasks.migration.moving import Moving
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.settings import MigrationConfig
 
 pytestmark = pytest.mark.anyio
 

@@ -11,8 +11,8 @@ from appliance.model import Need, Phase, RunRequest
 from appliance.pool.api import WarmAsk, Warmed
 from appliance.pool.selection import Decision
 from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.migration.settings import MigrationConfig
-from appliance.tasks.migration.taking import Taking
+from appliance.tasks.migration.handoff import Taking
+from appliance.tasks.settings import MigrationConfig
 
 pytestmark = pytest.mark.anyio
 

@@ -8,12 +8,22 @@ from msgspec.structs import replace
 from appliance.model import Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord
 from appliance.skills.catalogue import SkillManifest, load_catalogue
 from appliance.tasks import machine
-from appliance.tasks.replan.allowed import remainder
-from appliance.tasks.replan.decide import AskDecomposer, GiveUp, decide
-from appliance.tasks.replan.robots import Rebinding, Robots, another_robot, is_the_robots
-from appliance.tasks.replan.settings import ReplanConfig
-from appliance.tasks.replan.skills import Substitution, alternative_skill, mapped
-from appliance.tasks.replan.splice import problems, splice
+from appliance.tasks.replan import (
+    AskDecomposer,
+    GiveUp,
+    Rebinding,
+    Robots,
+    Substitution,
+    alternative_skill,
+    another_robot,
+    decide,
+    is_the_robots,
+    mapped,
+    problems,
+    remainder,
+    splice,
+)
+from appliance.tasks.settings import ReplanConfig
 from appliance.tasks.transition import Transition, TransitionKind
 
 SKILLS = load_catalogue().skills

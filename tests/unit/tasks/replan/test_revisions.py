@@ -10,11 +10,9 @@ from msgspec.structs import replace
 
 from appliance.model import Decision, Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord, TaskState, encode
 from appliance.skills.catalogue import Alternative, SkillManifest
-from appliance.tasks import machine, revising
-from appliance.tasks.replan.robots import Rebinding, Robots, another_robot
-from appliance.tasks.replan.settings import ReplanConfig
-from appliance.tasks.replan.skills import Substitution, alternative_skill
-from appliance.tasks.replan.splice import problems, splice
+from appliance.tasks import machine
+from appliance.tasks.replan import Rebinding, Robots, Substitution, alternative_skill, another_robot, problems, splice
+from appliance.tasks.settings import ReplanConfig
 from appliance.tasks.transition import StaleTransitionError, Transition, TransitionKind
 
 SKILLS = {
@@ -78,7 +76,7 @@ class Walk:
         names = [each.subtask.id for each in record.subtasks]
         assert len(set(names)) == len(names)
         assert not set(names) & set(record.retired), "an id was given again"
-        assert not revising.cyclic(tuple(each.subtask for each in record.subtasks))
+        assert not machine.cyclic(tuple(each.subtask for each in record.subtasks))
         for name, result in self.finished.items():
             assert record.of(name).result == result, "something finished was lost"
         for each in record.subtasks:
@@ -87,13 +85,13 @@ class Walk:
         if before is not None and before.subtasks:
             gone = {each.subtask.id for each in before.subtasks} - set(names)
             states = {before.of(name).state for name in gone}
-            assert not states & {SubtaskState.SUCCEEDED, *revising.ACTIVE}, "a run was left behind"
+            assert not states & {SubtaskState.SUCCEEDED, *machine.ACTIVE}, "a run was left behind"
 
     def act(self, choose: st.DataObject) -> None:
         """Do one thing that could happen now."""
         record = self.record
         assert record is not None
-        stranded = revising.stranded(record)
+        stranded = machine.stranded(record)
         options = ["run", "end", "fail", "notice", *(["rebind", "substitute", "propose"] * bool(stranded))]
         if record.proposal is not None:
             options = ["run", "end", "replan", "replan"]
@@ -195,7 +193,7 @@ def test_a_subtask_given_up_for_replanning_leaves_its_task_running() -> None:
     walk = base()
     assert walk.record is not None
     assert walk.record.state is TaskState.RUNNING
-    assert [each.subtask.id for each in revising.stranded(walk.record)] == ["s2"]
+    assert [each.subtask.id for each in machine.stranded(walk.record)] == ["s2"]
     walk.apply(TransitionKind.REPLAN_FAILED, subtask="s2", note="no other robot")
     assert walk.record.state is TaskState.FAILED
     assert walk.record.failure is not None

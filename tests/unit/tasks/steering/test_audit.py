@@ -8,8 +8,8 @@ from appliance.errors import ConflictError, PayloadError
 from appliance.model import Act, TaskRecord, TaskRequest, encode
 from appliance.pool.transfer.api import FetchAsk
 from appliance.robots.api import StopAsk
-from appliance.tasks.steering.api import ActsAsk, PauseAsk, RetryAsk
-from appliance.tasks.steering.audit import KEPT, Audit, target_of
+from appliance.tasks.api import ActsAsk, PauseAsk, RetryAsk
+from appliance.tasks.audit import KEPT, Audit, target_of
 
 pytestmark = pytest.mark.anyio
 

@@ -22,16 +22,9 @@ from appliance.model import (
     Tier,
 )
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.steering.api import ApproveAsk, PauseAsk, ResumeAsk, RetryAsk
-from appliance.tasks.steering.deciding import (
-    may_pause,
-    may_resume,
-    may_retry,
-    needed_robots,
-    needs_approval,
-    proposal_for,
-)
-from appliance.tasks.steering.hashing import matches, plan_hash
+from appliance.tasks.api import ApproveAsk, PauseAsk, ResumeAsk, RetryAsk
+from appliance.tasks.machine import matches, plan_hash
+from appliance.tasks.steering import may_pause, may_resume, may_retry, needed_robots, needs_approval, proposal_for
 
 PLAN = Plan(domain="any", subtasks=(Subtask(id="s1", skill="work", robot="r1"), Subtask(id="s2", skill="cut")))
 

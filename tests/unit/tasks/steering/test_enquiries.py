@@ -7,10 +7,10 @@ import pytest
 
 from appliance.errors import ConflictError, DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
 from appliance.model import Enquiry, encode
-from appliance.tasks.steering import enquiries as module
-from appliance.tasks.steering.api import AnswerAsk, EnquiriesAsk
-from appliance.tasks.steering.audit import Audit
-from appliance.tasks.steering.enquiries import Enquiries, enquiry_of, stronger
+from appliance.tasks import enquiries as module
+from appliance.tasks.api import AnswerAsk, EnquiriesAsk
+from appliance.tasks.audit import Audit
+from appliance.tasks.enquiries import Enquiries, enquiry_of, stronger
 
 pytestmark = pytest.mark.anyio
 

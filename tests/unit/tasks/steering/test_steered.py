@@ -21,13 +21,11 @@ from appliance.model import (
     encode,
 )
 from appliance.tasks import machine
-from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.keeper import Keeper
-from appliance.tasks.migration.api import Held
-from appliance.tasks.steering.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
-from appliance.tasks.steering.driving import revived
-from appliance.tasks.steering.hashing import plan_hash
-from appliance.tasks.surroundings import CancelAsked, Wake
+from appliance.tasks.api import ApproveAsk, Held, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunAsk, RunStatus
+from appliance.tasks.context import CancelAsked, Wake
+from appliance.tasks.machine import plan_hash
+from appliance.tasks.record_writer import Keeper
+from appliance.tasks.steering import revived
 
 pytestmark = pytest.mark.anyio
 

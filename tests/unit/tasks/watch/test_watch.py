@@ -9,10 +9,9 @@ from msgspec.structs import replace
 
 from appliance.model import Failure, LogLine, Notice, Phase, RunEvent, RunEventKind
 from appliance.tasks.api import TaskLinesAsk
+from appliance.tasks.lines import Line, LineKind, of_event, of_log, of_notice, of_transition
+from appliance.tasks.stream import Kept, Merge
 from appliance.tasks.transition import Transition, TransitionKind
-from appliance.tasks.watch.kept import Kept
-from appliance.tasks.watch.lines import Line, LineKind, of_event, of_log, of_notice, of_transition
-from appliance.tasks.watch.merge import Merge
 
 SECOND = 1_000_000_000
 

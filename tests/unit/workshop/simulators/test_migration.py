@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.tasks.migration.settings import MigrationConfig
+from appliance.tasks.settings import MigrationConfig
 from workshop.simulators.migration import Moved, Outcome, simulate, uneven
 
 CONFIG = MigrationConfig(cpu_high=0.0)

@@ -1,0 +1,140 @@
+"""The audit of operators' orders: who ordered what of whom, why, and what came of it, on one key and in the log."""
+
+import time
+import uuid
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import TypeVar, cast
+
+import structlog
+from msgspec import Struct
+
+from appliance.errors import SwiftbotError
+from appliance.model import Act, Signed, TaskRecord, TaskRequest, encode
+from appliance.plane.keys import Keys
+from appliance.plane.session import Closer, Session
+from appliance.tasks.api import ActList, ActsAsk
+from appliance.tasks.records import clean
+
+log = structlog.get_logger(__name__)
+
+SUBMIT = "submit"
+
+KEPT = 500
+"""Orders that a gateway remembers for those who ask, its own and others'; the log on disk has all."""
+MAX_PROBLEM = 1000
+_TARGETS = ("id", "task", "robot", "robots", "container", "image", "folder", "reference")
+
+Q = TypeVar("Q", bound=Signed)
+R = TypeVar("R", bound=Struct)
+Submit = Callable[[TaskRequest], Awaitable[TaskRecord]]
+
+
+class Audit:
+    """One per gateway. `signed` puts an audit around what answers an operator's verb."""
+
+    def __init__(self, session: Session, keys: Keys, gateway: str) -> None:
+        self._session = session
+        self._keys = keys
+        self._gateway = gateway
+        self._acts: deque[tuple[float, Act]] = deque(maxlen=KEPT)
+        self._submissions: deque[tuple[float, Act]] = deque(maxlen=KEPT)
+        """Apart, so that a script that submits all day does not push out who stopped what."""
+
+    def listen(self) -> Closer:
+        """Remember what was ordered of others too: a gateway that dies takes no order along."""
+        return self._session.subscribe_typed(self._keys.act(), Act, self._on_act)
+
+    def _on_act(self, key: str, act: Act | None) -> None:
+        if act is not None and act.gateway != self._gateway and key.endswith(f"/{act.gateway}"):
+            self._keep(act)
+
+    def _keep(self, act: Act) -> None:
+        (self._submissions if act.verb == SUBMIT else self._acts).append((time.monotonic(), act))
+
+    def signed(
+        self, verb: str, handler: Callable[[Q], Awaitable[R]], *, when: Callable[[Q], bool] = lambda _: True
+    ) -> Callable[[Q], Awaitable[R]]:
+        """Return the handler with an audit around it; what gateways hand on to each other (`here`) has none.
+
+        Args:
+            verb: as it is registered.
+            handler: what answers.
+            when: whether a request is an operator's at all.
+        """
+
+        async def answer(ask: Q) -> R:
+            if getattr(ask, "here", False) or not when(ask):
+                return await handler(ask)
+            return await self._noted(verb, ask, handler)
+
+        return answer
+
+    def submission(
+        self, handler: Callable[[TaskRequest], Awaitable[TaskRecord]]
+    ) -> Callable[[TaskRequest], Awaitable[TaskRecord]]:
+        """Return the handler of `submit` with an audit around it: who wants it stands in the request itself."""
+
+        async def answer(request: TaskRequest) -> TaskRecord:
+            target = request.id or "a new task"
+            return await self._noted(SUBMIT, Signed(by=request.submitter), lambda _: handler(request), target)
+
+        return answer
+
+    async def _noted(self, verb: str, ask: Q, handler: Callable[[Q], Awaitable[R]], target: str = "") -> R:
+        began = time.monotonic()
+        try:
+            reply = await handler(ask)
+        except SwiftbotError as error:
+            self._note(verb, ask, began, error.code, error.message, target)
+            raise
+        except Exception as error:
+            self._note(verb, ask, began, "internal", f"{type(error).__name__}: {error}", target)
+            raise
+        self._note(verb, ask, began, "done", "", target)
+        return reply
+
+    def _note(self, verb: str, ask: Signed, began: float, outcome: str, problem: str, target: str) -> None:
+        act = Act(
+            id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
+            verb=verb,
+            by=clean(ask.by, 120) or "unsigned",
+            target=clean(target, 300) or target_of(ask),
+            why=clean(ask.why, 500),
+            outcome=outcome,
+            problem=clean(problem, MAX_PROBLEM),
+            gateway=self._gateway,
+            at_ns=time.time_ns(),
+            took_ms=round((time.monotonic() - began) * 1e3, 2),
+        )
+        self._keep(act)
+        self._session.put(self._keys.act(self._gateway), encode(act))
+        log.info(
+            "operator's order",
+            verb=verb,
+            by=act.by,
+            target=act.target,
+            why=act.why,
+            outcome=outcome,
+            problem=act.problem,
+            act=act.id,
+        )
+
+    async def acts(self, ask: ActsAsk) -> ActList:
+        """Answer `acts`."""
+        # By when they were heard of here: clocks of gateways differ.
+        newest = sorted((*self._acts, *self._submissions), key=lambda heard: heard[0], reverse=True)
+        return ActList(acts=tuple(act for _, act in newest[: max(0, ask.limit)]))
+
+
+def target_of(ask: Signed) -> str:
+    """What an order is about, by the fields that such requests have."""
+    found: list[str] = []
+    for name in _TARGETS:
+        value: object = getattr(ask, name, "")
+        if isinstance(value, tuple):
+            found.append(", ".join(cast("tuple[str, ...]", value)) or "the fleet")
+        elif value:
+            found.append(str(value))
+    subtask = str(getattr(ask, "subtask", "") or "")
+    return clean("/".join([*found, *([subtask] if subtask else [])]), 300)

@@ -1,1 +1,0 @@
-"""Dynamic groups: which gateways may serve a task, and which of them leads (paper, Dynamic Groups)."""

@@ -1,0 +1,257 @@
+"""What a handler may ask of the appliance while it runs: robot commands, notices, questions to people, files.
+
+Every effect has the id `task/subtask/n`, n being the number of the call within the handler, the same in a
+repeated attempt; whoever carries it out does it once per id. So a gateway that dies between doing and
+telling never doubles an effect.
+"""
+
+import asyncio
+import base64
+import re
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, cast
+
+import msgspec
+import structlog
+from msgspec import Struct
+from msgspec.structs import replace
+
+from appliance.errors import ConflictError, PayloadError, RobotError, SwiftbotError, from_code
+from appliance.model import Notice, RobotCommand, RobotReply, encode
+from appliance.plane.keys import check_name
+from appliance.plane.node import Plane
+from appliance.pool.pool import Call
+from appliance.robots.limits import CHOSEN
+from appliance.robots.sender import send_command
+from appliance.tasks.api import ArtifactAsk, ArtifactPiece
+from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.enquiries import Enquiries, enquiry_of
+from appliance.tasks.placement import waits_for_lost
+from appliance.tasks.records import MAX_RUN_S, clean
+
+log = structlog.get_logger(__name__)
+
+Orders = Callable[[str, RobotCommand, frozenset[str], bool], RobotCommand]
+
+_NOT_A_NAME = re.compile(r"[^a-z0-9_.-]")
+HEARD_S = 0.5
+"""How long after a command was cancelled a soft stop may still be on its way here."""
+ANSWER_S = 240.0
+"""How long people are waited for when a handler does not say."""
+LOST_LOOK_S = 1.0
+"""How often a command that waits for its answer looks whether its robot is still there."""
+BUSY_RETRY_S = 0.5
+"""Pause before a busy robot is asked again."""
+
+
+class Calls:
+    """Carries out handlers' calls on one gateway."""
+
+    def __init__(
+        self,
+        plane: Plane,
+        artifacts: Artifacts,
+        *,
+        on_wait: Callable[[Call, str], None],
+        hindrance: Callable[[str], str] = lambda _: "",
+        enquiries: Enquiries | None = None,
+        orders: Orders = lambda _, command, __, ___: command,
+    ) -> None:
+        """Make them.
+
+        Args:
+            plane: the fleet.
+            artifacts: files of handlers.
+            on_wait: told what a call waits for.
+            hindrance: why a robot may not be commanded just now, "" when it may.
+            enquiries: takes questions to people.
+            orders: returns an order as it may be sent to a robot, given the arguments that no plan asked for and
+                whether an earlier attempt may have begun it; raises a SwiftbotError with the reason when it may not be.
+        """
+        self._orders = orders
+        self._enquiries = enquiries
+        self._hindrance = hindrance
+        self._plane = plane
+        self._artifacts = artifacts
+        self._on_wait = on_wait
+
+    async def __call__(self, call: Call) -> dict[str, Any]:
+        """Carry out one call and return its answer; a SwiftbotError is the handler's to see."""
+        match call.name:
+            case "command":
+                return await self._command(call)
+            case "notify":
+                return await self._notify(call)
+            case "ask":
+                return await self._ask(call)
+            case "put_artifact":
+                return await self._put(call)
+            case "get_artifact":
+                return await self._get(call)
+            case _:
+                raise PayloadError(f"a handler asked for {call.name[:40]!r}, which the appliance does not offer")
+
+    async def _command(self, call: Call) -> dict[str, Any]:
+        run = call.run
+        if run.robot is None:
+            raise PayloadError(f"{run.skill} commands a robot but its subtask names none")
+        verb = str(call.args.get("verb", ""))
+        given: object = call.args.get("args") or {}
+        if not isinstance(given, dict):
+            raise PayloadError(f"the arguments of {verb[:40]!r} are not a table")
+        args = cast("dict[str, Any]", given)
+        timeout_s = _timeout(call.args.get("timeout_s", 60.0))
+        command = RobotCommand(
+            id=_effect(call), verb=verb, args=args, task=run.task, subtask=run.subtask, attempt=run.attempt
+        )
+        # The same id of an earlier attempt: a robot that drives it already is joined, one that has done it answers.
+        begun = run.attempt > 1 or run.resume is not None
+        give_up = time.monotonic() + timeout_s
+        while True:
+            await self._until_free(call, run.robot, give_up)
+            # What the robot and its site allow may have changed meanwhile, and so may where it is.
+            sent = self._orders(run.robot, command, CHOSEN - run.params.keys(), begun)
+            left = give_up - time.monotonic()
+            doubtful = self._plane.registry.doubtful(run.robot)
+            reply = await self._noting_loss(
+                call,
+                run.robot,
+                send_command(
+                    self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful,
+                    on_silence=lambda note: self._on_wait(call, note),
+                ),
+            )  # fmt: skip
+            if reply.failure is None:
+                return _answer(reply)
+            if reply.failure.code == "cancelled" and await self._was_stopped(run.robot):
+                # Its task hears of the stop or lease as well, and ends this run; its next attempt does the rest.
+                await self._until_free(call, run.robot, give_up)
+            if reply.failure.code != "busy" or left <= BUSY_RETRY_S:
+                error = from_code(reply.failure.code, reply.failure.message, reply.failure.remedy)
+                if type(error) is SwiftbotError:
+                    error = RobotError(reply.failure.message, remedy=reply.failure.remedy)
+                raise error
+            self._on_wait(call, f"waits for {run.robot}: {reply.failure.message}")
+            await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _noting_loss(self, call: Call, robot: str, sending: Coroutine[Any, Any, RobotReply]) -> RobotReply:
+        """Wait for a robot's answer, and tell when the robot is lost meanwhile, and when it is back."""
+        registry = self._plane.registry
+        answer = asyncio.ensure_future(sending)
+        lost = False
+        try:
+            while not (await asyncio.wait({answer}, timeout=LOST_LOOK_S))[0]:
+                info = registry.robots.get(robot)
+                gone = info is None or not info.online
+                if gone and not lost:
+                    self._on_wait(call, waits_for_lost(robot, info, registry.lost_ns.get(robot)))
+                elif lost and not gone:
+                    self._on_wait(call, f"{robot} is back")
+                lost = gone
+            return answer.result()
+        finally:
+            answer.cancel()
+
+    async def _until_free(self, call: Call, robot: str, give_up: float) -> None:
+        """Wait while a robot is stopped or an operator has it; RobotError when that lasts too long."""
+        while why := self._hindrance(robot):
+            if time.monotonic() >= give_up:
+                raise RobotError(f"{robot} is {why}", remedy="the task goes on when that is over")
+            self._on_wait(call, f"waits for {robot}: {why}")
+            await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _was_stopped(self, robot: str) -> bool:
+        """Whether a command was ended by a soft stop or a lease, of which the robot may have heard first."""
+        until = time.monotonic() + HEARD_S
+        while not self._hindrance(robot):
+            if time.monotonic() >= until:
+                return False
+            await asyncio.sleep(0.02)
+        return True
+
+    async def _notify(self, call: Call) -> dict[str, Any]:
+        effect = _effect(call)
+        to = _NOT_A_NAME.sub("_", str(call.args.get("to", "operator")).lower()).strip("_.-")[:60] or "operator"
+        key = f"effect/{effect}"
+        version = None
+        try:
+            version = await self._plane.dht.write(key, encode(_Effect(done=False)), expected=None)
+        except ConflictError:
+            record = await self._plane.dht.read(key)
+            if record is not None and msgspec.json.decode(record.value, type=_Effect).done:
+                return {"notice": effect, "repeated": True}
+            version = record.version if record else None
+        notice = Notice(
+            id=effect,
+            to=check_name(to, "recipient"),
+            text=clean(str(call.args.get("text", "")), 4000),
+            task=call.run.task,
+            gateway=self._plane.gateway,
+            at_ns=time.time_ns(),
+        )
+        self._plane.session.put(self._plane.keys.notice(notice.to), encode(notice))
+        try:
+            await self._plane.dht.write(key, encode(_Effect(done=True)), expected=version)
+        except ConflictError:
+            log.info("notice was settled by another attempt", effect=effect)
+        return {"notice": effect, "to": notice.to}
+
+    async def _ask(self, call: Call) -> dict[str, Any]:
+        if self._enquiries is None:
+            raise PayloadError("this gateway takes no questions to people")
+        args = call.args
+        enquiry = enquiry_of(
+            _effect(call),
+            question=args.get("question"),
+            choices=args.get("choices") or [],
+            to=args.get("to", "operator"),
+            expires_s=_timeout(args.get("timeout_s", ANSWER_S)),
+        )
+        asked = replace(enquiry, robot=call.run.robot or "")
+        answered = await self._enquiries.ask(asked, on_wait=lambda note: self._on_wait(call, note))
+        return {"answer": answered.answer or "", "by": answered.by}
+
+    async def _put(self, call: Call) -> dict[str, Any]:
+        data = call.args.get("data", b"")
+        if isinstance(data, str):
+            try:
+                data = base64.b64decode(data, validate=True)
+            except ValueError as error:
+                raise PayloadError(f"the file's bytes are not base64: {error}") from error
+        if not isinstance(data, bytes):
+            raise PayloadError("put_artifact needs bytes", remedy="encode text first")
+        reference = await self._artifacts.put(
+            str(call.args.get("name", "file")), data, str(call.args.get("media_type", "application/octet-stream"))
+        )
+        return cast("dict[str, Any]", msgspec.to_builtins(reference))
+
+    async def _get(self, call: Call) -> dict[str, Any]:
+        reference = call.args.get("ref")
+        if not isinstance(reference, dict):
+            raise PayloadError("get_artifact needs a reference from a result")
+
+        async def ask(member: str, piece: ArtifactAsk) -> ArtifactPiece:
+            return await self._plane.rpc.call(member, "artifact", piece, ArtifactPiece)
+
+        data = await self._artifacts.get(cast("dict[str, Any]", reference), ask=ask, members=self._plane.members())
+        return {"data": data}
+
+
+def _timeout(value: object) -> float:
+    """Seconds a command may take, as a handler says; PayloadError when that is no positive number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MAX_RUN_S:
+        raise PayloadError(f"timeout_s {str(value)[:40]} is not between 0 and {MAX_RUN_S:g} s")
+    return float(value)
+
+
+class _Effect(Struct):
+    done: bool
+
+
+def _effect(call: Call) -> str:
+    return f"{call.run.task}/{call.run.subtask}/{call.number}"
+
+
+def _answer(reply: RobotReply) -> dict[str, Any]:
+    return {**reply.result, "blobs": reply.blobs} if reply.blobs else dict(reply.result)

@@ -1,0 +1,328 @@
+"""Where the subtasks that this gateway coordinates go: the group of each task, the member, the robot, and when.
+
+It ties the plain functions of `placement` together with what is known of the fleet: the coarse level forms the group
+and scores its members for each subtask; the fine level, the selection of a container, is the member's own.
+"""
+
+import asyncio
+import hashlib
+import math
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
+
+import structlog
+
+from appliance.errors import NotFoundError, SwiftbotError
+from appliance.model import GatewayStatus, Group, SubtaskRecord, TaskRecord
+from appliance.plane.node import Plane
+from appliance.skills.catalogue import Catalogue
+from appliance.tasks import machine
+from appliance.tasks.api import SkillList, SkillsAsk
+from appliance.tasks.context import need_of, task_key
+from appliance.tasks.placement import (
+    Asked,
+    Line,
+    Place,
+    Placement,
+    Standing,
+    Want,
+    Weights,
+    bind,
+    form,
+    holds,
+    image_holders,
+    must_form,
+    place,
+    placement_case,
+    settled_load,
+    tell,
+    warmth,
+    why_not,
+)
+from appliance.tasks.settings import TasksConfig
+
+log = structlog.get_logger(__name__)
+
+MOST_CATALOGUES = 256
+"""Catalogues of other gateways that are remembered: mostly all have the same."""
+
+
+class Scheduler:
+    """Decides for the tasks driven here.
+
+    Args:
+        plane: the fleet.
+        catalogue: skills known here.
+        config: weights, sizes, bounds.
+        records: the tasks driven here.
+        wake: told a task of which a subtask may go now.
+        image_of: full reference of an image of the catalogue.
+        hindrance: why tasks may not command a robot just now; "" when they may.
+        shuns: skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it.
+    """
+
+    def __init__(
+        self,
+        plane: Plane,
+        catalogue: Catalogue,
+        config: TasksConfig,
+        *,
+        records: Callable[[], Iterable[TaskRecord]],
+        wake: Callable[[str], None],
+        image_of: Callable[[str], str],
+        hindrance: Callable[[str], str] = lambda _: "",
+        shuns: Callable[[str, str], str] = lambda _skill, _robot: "",
+    ) -> None:
+        self._plane = plane
+        self._catalogue = catalogue
+        self._config = config
+        self._records = records
+        self._image_of = image_of
+        self._hindrance = hindrance
+        self._shuns = shuns
+        self._looked: dict[str, float] = {}
+        """Task -> when its group was last looked at as a whole."""
+        self._skills: dict[str, frozenset[str]] = {}
+        """Digest of a catalogue -> the skills in it."""
+        self._asking: dict[str, float] = {}
+        """Digest of a catalogue -> when it may be asked for again."""
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._asked: tuple[Placement, Asked] | None = None
+        """The last placement, and what it was made from."""
+        self.digest = digest_of(catalogue)
+        self._skills[self.digest] = frozenset(name for name, each in catalogue.skills.items() if each.implemented)
+        self.line = Line(self.gateways, backlog=config.backlog, wake=wake)
+        self._weights = Weights(load=config.load_weight, data=config.data_weight, warm=config.warm_weight)
+
+    def gateways(self) -> Mapping[str, GatewayStatus]:
+        """What the gateways that are there tell of themselves."""
+        members = self._plane.members()
+        return {name: status for name, status in self._plane.registry.gateways.items() if name in members}
+
+    # --- robots -----------------------------------------------------------------------------------------------
+
+    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
+        """Choose the robot of a subtask, or None with the reason for the wait."""
+        skills = self._catalogue.skills
+        manifests = {
+            each.subtask.id: skills[each.subtask.skill] for each in record.subtasks if each.subtask.skill in skills
+        }
+        return bind(
+            target.subtask.robot or "",
+            record.subtasks,
+            robots=self._plane.registry.robots,
+            uses={key: manifest.uses for key, manifest in manifests.items()},
+            verbs={key: manifest.verbs for key, manifest in manifests.items()},
+            busy=self.busy_robots(),
+            hindrance=self._hindrance,
+            shuns=lambda each, robot: self._shuns(each.subtask.skill, robot),
+            lost_ns=self._plane.registry.lost_ns,
+        )
+
+    def busy_robots(self) -> frozenset[str]:
+        """Return the robots with a run in progress, as far as this gateway coordinates them."""
+        return frozenset(
+            each.bound_robot for record in self._records() for each in machine.active(record) if each.bound_robot
+        )
+
+    # --- groups -----------------------------------------------------------------------------------------------
+
+    def regroup(self, record: TaskRecord) -> Group | None:
+        """Return the group that a task should have from now on, or None when the present one may stay."""
+        now = time.monotonic()
+        looked = now - self._looked.get(record.id, -math.inf) < self._config.regroup_s
+        key = task_key(record.id)
+        root = self._plane.ring.owner(key)
+        ready = [each.subtask.id for each in machine.ready(record)]
+        if looked and record.group is not None:
+            # Between two looks at the fleet only the members are looked at: there may be hundreds of others.
+            members = {each.gateway: each for each in self.standings(record, record.group.members)}
+            served = frozenset[str]().union(*(each.serves for each in members.values()))
+            if not must_form(record.group, members, root=root, ready=()) and served.issuperset(ready):
+                return None
+        standings = {each.gateway: each for each in self.standings(record)}
+        why = must_form(record.group, standings, root=root, ready=ready)
+        if not why and looked:
+            return None
+        self._looked[record.id] = now
+        group = form(
+            standings.values(),
+            root=root,
+            previous=record.group,
+            limit=self._config.group_size,
+            weights=self._weights,
+            why=why or "others suit better by now",
+        )
+        return None if group is record.group else group
+
+    def standings(self, record: TaskRecord, names: Collection[str] | None = None) -> list[Standing]:
+        """What is known of the gateways that are there with regard to a task; `names`: of these alone."""
+        gateways = self.gateways()
+        holders = self._holders(gateways, record)
+        wanted = [each for each in record.subtasks if not each.state.final]
+        wants = {each.subtask.id: want for each in wanted if (want := self._want(each)) is not None}
+        ready = [each for each in machine.ready(record) if each.subtask.id in wants] or [
+            each for each in wanted if each.subtask.id in wants
+        ][:1]
+        near = [holds(record, each, wants[each.subtask.id].need.volumes, gateways) for each in ready]
+        found: list[Standing] = []
+        for name, status in gateways.items():
+            if names is not None and name not in names:
+                continue
+            reasons = {subtask: self._why_not(want, status, holders, record.within) for subtask, want in wants.items()}
+            containers = tuple(self._plane.registry.containers.get(name, {}).values())
+            warm = [warmth(wants[each.subtask.id].need, containers) for each in ready]
+            found.append(
+                Standing(
+                    gateway=name,
+                    load=settled_load(status.load, self._plane.registry.stale_s(name)),
+                    near=sum(each.get(name, 0.0) for each in near) / len(near) if near else 0.0,
+                    warm=sum(warm) / len(warm) if warm else 0.0,
+                    serves=frozenset(subtask for subtask, reason in reasons.items() if not reason),
+                    why_not=next(iter(reasons.values()), "") or ("is draining" if status.draining else ""),
+                )
+            )
+        return found
+
+    def _want(self, target: SubtaskRecord) -> Want | None:
+        manifest = self._catalogue.skills.get(target.subtask.skill)
+        if manifest is None:
+            return None
+        need = need_of(manifest)
+        return Want(subtask=target.subtask.id, skill=target.subtask.skill, need=need, image=self._image_of(need.image))
+
+    def _holders(
+        self, gateways: Mapping[str, GatewayStatus], record: TaskRecord
+    ) -> Mapping[str, frozenset[str] | None]:
+        """Who has the images of a task's skills, by their references."""
+        skills = (self._catalogue.skills.get(each.subtask.skill) for each in record.subtasks)
+        images = {self._image_of(each.image) for each in skills if each is not None} - {""}
+        return {image: image_holders(gateways, image) for image in images}
+
+    def _why_not(
+        self,
+        want: Want,
+        status: GatewayStatus,
+        holders: Mapping[str, frozenset[str] | None],
+        within: tuple[str, ...],
+    ) -> str:
+        containers = self._plane.registry.containers.get(status.id, {}).values()
+        return why_not(
+            want,
+            status,
+            ready=any(want.need.image in (each.image, *each.compatible) for each in containers),
+            skills=self._skills_of(status),
+            holders=holders.get(want.image),
+            within=within,
+        )
+
+    def _skills_of(self, status: GatewayStatus) -> frozenset[str] | None:
+        """The skills a gateway knows: mostly those known here; another catalogue is asked for once."""
+        if not status.catalogue:
+            return None
+        known = self._skills.get(status.catalogue)
+        now = time.monotonic()
+        if known is None and self._asking.get(status.catalogue, 0.0) <= now and len(self._skills) < MOST_CATALOGUES:
+            self._asking[status.catalogue] = now + self._config.regroup_s
+            asking = asyncio.create_task(self._ask_skills(status.id, status.catalogue), name=f"skills of {status.id}")
+            self._tasks.add(asking)
+            asking.add_done_callback(self._tasks.discard)
+        return known
+
+    async def _ask_skills(self, gateway: str, digest: str) -> None:
+        try:
+            answer = await self._plane.rpc.call(gateway, "skills", SkillsAsk(), SkillList, timeout_s=2.0)
+        except SwiftbotError as error:
+            log.info("a gateway does not tell its skills", gateway=gateway, reason=str(error))
+            return
+        if answer.digest == digest:
+            self._skills[digest] = frozenset(answer.skills)
+            self._asking.pop(digest, None)
+
+    async def skills(self, _: SkillsAsk) -> SkillList:
+        """Answer `skills`: what this gateway knows."""
+        return SkillList(digest=self.digest, skills=tuple(sorted(self._skills[self.digest])))
+
+    # --- members ----------------------------------------------------------------------------------------------
+
+    def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
+        """Order the members of a task's group for a subtask by the coarse score, with why the others are none."""
+        registry = self._plane.registry
+        want = self._want(target)
+        if want is None:
+            raise NotFoundError(f"{self._plane.gateway} has no skill {target.subtask.skill[:80]!r}")
+        gateways = self.gateways()
+        members = record.group.members if record.group is not None else tuple(gateways)
+        holders = self._holders(gateways, record)
+        excluded: dict[str, str] = {}
+        for name, status in gateways.items():
+            if name not in members:
+                excluded[name] = "is not in the task's group"
+            elif reason := self._why_not(want, status, holders, record.within):
+                excluded[name] = reason
+        registry.asked(want.need.image)
+        stale_s = {name: late_s for name in gateways if (late_s := registry.stale_s(name))}
+        for name in stale_s:
+            registry.doubt(name)
+        asked = Asked(
+            need=want.need,
+            here=self._plane.gateway,
+            gateways=gateways,
+            containers=registry.containers,
+            holds=holds(record, target, want.need.volumes, registry.gateways),
+            robot=registry.robots.get(robot) if robot else None,
+            avoid=frozenset(each.gateway for each in target.attempts if each.failure),
+            stale_s=stale_s,
+            config=self._config,
+        )
+        placement = place(
+            asked.need,
+            here=asked.here,
+            gateways=gateways,
+            containers=asked.containers,
+            holds=asked.holds,
+            robot=asked.robot,
+            avoid=asked.avoid,
+            config=self._config,
+            excluded=excluded,
+            stale_s=stale_s,
+        )
+        self._asked = (placement, asked)
+        return placement
+
+    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
+        """Tell, for the log, how the gateways stood when a subtask was sent as its placement has just said."""
+        if self._config.tell_decisions and self._asked is not None and self._asked[0] is placement:
+            tell(self._plane, placement_case(placement, self._asked[1], record, target))
+
+    def likely_place(self, record: TaskRecord, target: SubtaskRecord) -> str:
+        """The gateway that a subtask would be sent to now, or ""."""
+        robot = self.bind(record, target)[0] if target.subtask.robot else None
+        return next(iter(self.place(record, target, robot).order), "")
+
+    # --- turns ------------------------------------------------------------------------------------------------
+
+    def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
+        """Return where a ready subtask may go now, or its place among those that wait for room."""
+        return self.line.ask(record, target, placement.order, time.monotonic(), left_s=left_s)
+
+    def moved(self, record: TaskRecord) -> None:
+        """Note how a task stands."""
+        self.line.moved(record, time.monotonic())
+
+    async def close(self) -> None:
+        """Ask nothing more."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def forget(self, task: str) -> None:
+        """Note that a task is not driven here any more."""
+        self.line.forget(task, time.monotonic())
+        self._looked.pop(task, None)
+
+
+def digest_of(catalogue: Catalogue) -> str:
+    """Return what tells two catalogues apart: a digest of the names of the skills that can be run."""
+    names = sorted(name for name, each in catalogue.skills.items() if each.implemented)
+    return hashlib.sha256("\n".join(names).encode()).hexdigest()[:12]
