@@ -13,7 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import anyio
 import anyio.to_thread
@@ -40,29 +40,6 @@ class Reference(Struct, frozen=True, kw_only=True):
     media_type: str
     bytes: int
     gateway: str
-
-
-def bytes_by_gateway(value: object) -> dict[str, int]:
-    """Bytes of the files that references anywhere in results name, by the gateway where each was made.
-
-    The same file is counted once. What is not a good reference is left out: results are handlers' doing.
-    """
-    found: dict[str, int] = {}
-    seen: set[str] = set()
-    level: list[object] = [value]
-    while level:
-        each = level.pop()
-        if isinstance(each, dict):
-            table = cast("dict[str, object]", each)
-            digest, gateway, size = table.get("artifact"), table.get("gateway"), table.get("bytes", 0)
-            if not isinstance(digest, str):
-                level.extend(table.values())
-            elif isinstance(gateway, str) and isinstance(size, int) and size >= 0 and digest not in seen:
-                seen.add(digest)
-                found[gateway] = found.get(gateway, 0) + size
-        elif isinstance(each, list | tuple):
-            level.extend(cast("list[object]", each))
-    return found
 
 
 class Artifacts:

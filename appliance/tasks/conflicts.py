@@ -43,7 +43,7 @@ from appliance.pool import lineage
 from appliance.tasks import checkpoints, enquiries
 from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.record_writer import Keeper
-from appliance.tasks.records import MAX_NOTE, clean
+from appliance.tasks.records import MAX_NOTE, clean, unsettled
 from appliance.tasks.transition import TransitionKind
 
 MOST_SPLITS = 8
@@ -171,21 +171,6 @@ OVERTAKEN = Failure(
     code="unreachable", message="a later attempt had been made on the other side of a partition", retryable=True
 )
 _ACTIVE = (SubtaskState.DISPATCHED, SubtaskState.RUNNING)
-
-
-def unsettled(record: TaskRecord) -> tuple[Split, ...]:
-    """Versions that lost and are not dealt with yet, or were dealt with in a version that itself lost later.
-
-    Of the latter the mark that they are settled outlives (`resolve.merged`), and the fences do not: without them a
-    second attempt would be given a number, and its gateway answer with what came of the first.
-    """
-    return tuple(each for each in record.splits if not each.settled or _unfenced(record, each))
-
-
-def _unfenced(record: TaskRecord, split: Split) -> bool:
-    """Whether an attempt of a version that lost has a number that the next attempt of this version may be given."""
-    made = {run.subtask: run.attempt for run in sorted(split.runs, key=lambda run: run.attempt)}
-    return any(made.get(each.subtask.id, 0) >= each.next_attempt and not each.state.final for each in record.subtasks)
 
 
 def foreign(record: TaskRecord, event: RunEvent) -> bool:

@@ -63,7 +63,7 @@ from appliance.pool.selection import MOST_CONSIDERED, Candidate, Decision, Facts
 from appliance.pool.transfer.flow import Link
 from appliance.pool.turns import Turn, turn_of
 from appliance.tasks.api import ContainerList, RunAsk, RunStatus
-from appliance.tasks.artifacts import bytes_by_gateway
+from appliance.tasks.placement import bytes_by_gateway
 from appliance.tasks.records import MAX_NOTE, clean
 
 ASK_TIMEOUT_S = 0.15

@@ -43,7 +43,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, cast
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -63,7 +63,6 @@ from appliance.model import (
 from appliance.plane.node import Plane
 from appliance.pool.turns import Completions, Turn, Turns
 from appliance.tasks import machine
-from appliance.tasks.artifacts import bytes_by_gateway
 from appliance.tasks.settings import TasksConfig
 
 
@@ -391,6 +390,29 @@ def place(
         scores={row[2]: round(row[0], 3) for row in scored},
         excluded=without,
     )
+
+
+def bytes_by_gateway(value: object) -> dict[str, int]:
+    """Bytes of the files that references anywhere in results name, by the gateway where each was made.
+
+    The same file is counted once. What is not a good reference is left out: results are handlers' doing.
+    """
+    found: dict[str, int] = {}
+    seen: set[str] = set()
+    level: list[object] = [value]
+    while level:
+        each = level.pop()
+        if isinstance(each, dict):
+            table = cast("dict[str, object]", each)
+            digest, gateway, size = table.get("artifact"), table.get("gateway"), table.get("bytes", 0)
+            if not isinstance(digest, str):
+                level.extend(table.values())
+            elif isinstance(gateway, str) and isinstance(size, int) and size >= 0 and digest not in seen:
+                seen.add(digest)
+                found[gateway] = found.get(gateway, 0) + size
+        elif isinstance(each, list | tuple):
+            level.extend(cast("list[object]", each))
+    return found
 
 
 def trust(silent_s: float) -> float:

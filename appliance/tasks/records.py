@@ -24,7 +24,7 @@ from msgspec.structs import replace
 
 from appliance.errors import PayloadError
 from appliance.llm.checks.schema import MAX_SUBTASKS
-from appliance.model import Failure, RunEvent, RunEventKind, TaskRecord, encode
+from appliance.model import Failure, RunEvent, RunEventKind, Split, TaskRecord, encode
 
 MAX_DEPTH = 64
 """Nesting of parameters and results: far beyond any use, far below what JSON decoders refuse (about 1,000)."""
@@ -244,3 +244,18 @@ def _put(table: dict[str, Any], kind: type[Struct], kept: Unknown) -> None:
             if (more := rows.get(_which(item, shape.many[name]))) is not None:
                 _put(item, shape.many[name], more)
     table |= kept.fields
+
+
+def unsettled(record: TaskRecord) -> tuple[Split, ...]:
+    """Versions that lost and are not dealt with yet, or were dealt with in a version that itself lost later.
+
+    Of the latter the mark that they are settled outlives (`conflicts.merged`), and the fences do not: without them a
+    second attempt would be given a number, and its gateway answer with what came of the first.
+    """
+    return tuple(each for each in record.splits if not each.settled or _unfenced(record, each))
+
+
+def _unfenced(record: TaskRecord, split: Split) -> bool:
+    """Whether an attempt of a version that lost has a number that the next attempt of this version may be given."""
+    made = {run.subtask: run.attempt for run in sorted(split.runs, key=lambda run: run.attempt)}
+    return any(made.get(each.subtask.id, 0) >= each.next_attempt and not each.state.final for each in record.subtasks)

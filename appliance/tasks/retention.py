@@ -29,9 +29,8 @@ from appliance.plane.dht import LeaveOut, Record
 from appliance.plane.node import Plane
 from appliance.record.models import RecorderStatus
 from appliance.tasks import checkpoints, enquiries
-from appliance.tasks.conflicts import unsettled
 from appliance.tasks.context import PREFIX, task_key
-from appliance.tasks.records import MAX_NOTE, clean, read_record
+from appliance.tasks.records import MAX_NOTE, clean, read_record, unsettled
 from appliance.tasks.settings import TasksConfig
 
 MAX_INSTRUCTION = 80
