@@ -19,7 +19,7 @@ from tests.unit.tasks import test_executor
 from tests.unit.tasks.migration import test_draining, test_moving
 from tests.unit.tasks.migration.test_draining import Gateway, here
 from tests.unit.tasks.migration.test_moving import ASK, Fleet, start_there
-from tests.unit.tasks.test_driver import answer
+from tests.unit.tasks.test_coordinator import answer
 from tests.unit.tasks.test_executor import REQUEST, finish, until
 from tests.unit.tasks.test_healing import lost, record_of, split
 from tests.unit.tasks.test_machine import dispatched, planned, step
