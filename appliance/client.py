@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from appliance.connection import Endpoint
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError
 from appliance.model import Notice, RunEvent, Site, TaskRecord, TaskRequest, TaskState
-from appliance.plane.once import Once
+from appliance.plane.dedup import Deduplicator
 from appliance.pool.api import (
     DecisionList,
     DecisionsAsk,
@@ -306,7 +306,7 @@ class FleetClient(SteeringCalls):
 
     def on_notice(self, take: "asyncio.Queue[Notice]") -> None:
         """Have notices to people put into a queue, each once: both sides of a partition may have given it."""
-        once = Once()
+        once = Deduplicator()
 
         def heard(_: str, notice: Notice | None) -> None:
             if notice is not None and once.new(notice.id):

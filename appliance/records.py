@@ -8,9 +8,8 @@ from msgspec import Struct
 from appliance.connection import FleetConnection
 from appliance.errors import ConfigError, NotFoundError, SwiftbotError
 from appliance.model import VersionVector
-from appliance.plane.browsing import Copy, Listed, RecordList, RecordPlace, RecordsAsk
-from appliance.plane.messages import Found, KeyAsk, RecordAsk, RecordChange, Written
-from appliance.plane.versions import Record, check_key
+from appliance.plane.dht import Copy, Listed, RecordList, RecordPlace, RecordsAsk
+from appliance.plane.records import Found, KeyAsk, Record, RecordAsk, RecordChange, Written, check_key
 
 How = Literal["owner", "replica"]
 _OURS = ("task/", "checkpoint/", "effect/", "volume/", "lease/")

@@ -57,7 +57,7 @@ def router(
         lease_ms: A link silent for so long is dead; as the gateways have it in `plane.lease_ms`.
         log_format: json for journald and machines, text for a terminal.
     """
-    from appliance.plane.router import run_router
+    from appliance.plane.node import run_router
     from appliance.plane.settings import PlaneConfig
 
     logs.configure(style=log_format)

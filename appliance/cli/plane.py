@@ -151,7 +151,7 @@ def ls(
         limit: At most so many, 1 to 1,000.
     """
     from appliance.cli.records import held_table
-    from appliance.plane.browsing import MOST_LISTED
+    from appliance.plane.dht import MOST_LISTED
     from appliance.records import Records
 
     if not 1 <= limit <= MOST_LISTED:

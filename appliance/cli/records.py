@@ -3,8 +3,8 @@
 import msgspec
 from rich.table import Table
 
-from appliance.plane.browsing import Copy, RecordPlace
-from appliance.plane.versions import Record
+from appliance.plane.dht import Copy, RecordPlace
+from appliance.plane.records import Record
 from appliance.records import Held
 
 

@@ -1,14 +1,42 @@
-"""Opening a Zenoh session as configured, and the forms of its answers and errors: the library's rough edges.
+"""The links of a Zenoh session: how it is opened, which side dials, when a socket is given up.
 
-Split from `session` so that what is particular to the library's version stands in one place.
+`open_raw` opens a session as configured; `callback`, `reply` and the functions of errors are the forms that its
+callbacks, answers and errors have. What Zenoh 1.10 does not do right, or has no setting for, is worked round here:
+
+**Which of two gateways dials.** Where each dials the other there are two links, one made by either side, and both carry
+one Zenoh transport. When one side stands still for a lease the other closes both and begins anew; the one that runs
+again notices the ends of its two links one after the other, and in between takes the new link for a further one of the
+old transport. From then on the two mean different keys by the same numbers (zenoh issue 1886): questions arrive at
+wrong doors or nowhere, for as long as that link lives. In a fleet of eight with two links between each pair some
+gateway did not answer another after fourteen of 23 standstills; with one link between each pair all did after each of
+72 (docs/benchmarks.md). With one link this cannot happen: Zenoh takes one incoming link of a transport and no more, so
+that whoever dials anew is refused until the old link's end has been noticed, and with that link the old transport is
+gone.
+
+So each gateway has a rank, and the higher one dials. A gateway that is named in the others' `plane.peers` has a rank by
+its name; one that only names others (`plane.connect`) is above all of those. One with a table dials by nothing else.
+Those without go by Zenoh's gossip too, in the same order: of two that hear of each other the one with the greater
+session id dials, and the id ends with the rank. (Zenoh compares ids from their last byte on.)
+
+**When a socket is given up.** When a link breaks while its send buffer is full, Zenoh waits for the kernel to give the
+socket up before it forgets what it knew of the other side; by default that takes the kernel a quarter of an hour. If
+the two meet again before, one side goes on with what it knew and the other begins anew, with the same end. With
+TCP_USER_TIMEOUT (tcp(7)), which `SocketWatch` sets from outside, the kernel gives up after the lease, when Zenoh takes
+the other side for dead as well.
 """
-# pyright: reportUnknownMemberType=false
-# The library's stubs leave out the return types of methods that return nothing.
 
+import asyncio
 import contextlib
-from collections.abc import Callable
+import ipaddress
+import os
+import secrets
+import socket
+import stat
+from collections.abc import Callable, Mapping, Set
+from hashlib import blake2b
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
+from urllib.parse import urlsplit
 
 import msgspec
 import structlog
@@ -16,8 +44,176 @@ import zenoh
 
 from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError, from_code
 from appliance.model import ErrorReply, encode
-from appliance.plane import dialling
 from appliance.plane.settings import PlaneConfig
+
+_RANK_BYTES = 4
+_ID_BYTES = 16
+_NAMED, _NAMING = 0x20, 0xE0
+"""First byte of the rank, the class: of those that others name, and of those that only name others."""
+
+
+def rank(gateway: str) -> bytes:
+    """The rank of a gateway; by hash, which two tables agree on that have not all names in common."""
+    return bytes([_NAMED]) + blake2b(gateway.encode(), digest_size=_RANK_BYTES - 1).digest()
+
+
+def dialled(gateway: str, peers: Mapping[str, str]) -> tuple[str, ...]:
+    """The endpoints of `peers` (name to endpoint, a gateway's own perhaps among them) that a gateway dials."""
+    own = (rank(gateway), gateway)
+    return tuple(endpoint for name, endpoint in peers.items() if (rank(name), name) < own)
+
+
+def session_id(gateway: str, *, naming: bool) -> str:
+    """A new session id, 32 hexadecimal digits; `naming`: it only names others. An unnamed peer's rank is any."""
+    last = rank(gateway or secrets.token_hex(4))
+    if naming:
+        last = bytes([_NAMING]) + last[1:]
+    # Zenoh takes no id whose first digit is a zero.
+    first = bytes([secrets.randbelow(0xF0) + 0x10]) + secrets.token_bytes(_ID_BYTES - _RANK_BYTES - 1)
+    return (first + last[::-1]).hex()
+
+
+SOCKETS_EVERY_S = 0.5
+"""How often new sockets are looked for, half a lease: a link that hangs at once is let go before it is missed. A look
+takes 0.1 to 0.3 ms."""
+
+CALM_S = 10.0
+"""Least time before a link is broken again: where once does not help, a second time at once would only do harm."""
+
+Address = tuple[str, int]
+"""IP address and port."""
+
+
+class SocketWatch:
+    """Sets the time limit on every TCP socket of this process. `lease_ms`: after which unacknowledged data ends it."""
+
+    _running: ClassVar[dict[asyncio.AbstractEventLoop, "SocketWatch"]] = {}
+    """One for all sessions of a loop: each look is at the sockets of the whole process."""
+
+    def __init__(self, lease_ms: int) -> None:
+        self._users = 0
+        self._lease_ms = lease_ms
+        self._known: dict[int, int] = {}
+        """Descriptor -> inode of the sockets that have been looked at."""
+        self._task: asyncio.Task[None] | None = None
+
+    @classmethod
+    def shared(cls, lease_ms: int) -> "SocketWatch":
+        """The watch of the running loop's sessions, the shortest lease of theirs; each closes it when it ends."""
+        loop = asyncio.get_running_loop()
+        watch = cls._running.get(loop)
+        if watch is None:
+            watch = cls._running[loop] = cls(lease_ms)
+            watch._task = asyncio.create_task(watch._keep_looking(), name="socket watch")
+        elif lease_ms < watch._lease_ms:
+            watch._lease_ms, watch._known = lease_ms, {}
+        watch._users += 1
+        # Also at listening sockets, from which accepted ones inherit it.
+        with contextlib.suppress(OSError):
+            watch.look()
+        return watch
+
+    async def _keep_looking(self) -> None:
+        while True:
+            await asyncio.sleep(SOCKETS_EVERY_S)
+            with contextlib.suppress(OSError):  # no descriptor is left to list them with: next time
+                self.look()
+
+    def look(self) -> int:
+        """Set it on the sockets that are new; returns on how many."""
+        found: dict[int, int] = {}
+        changed = 0
+        for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are all that is wanted
+            number = int(name)
+            try:
+                about = os.fstat(number)
+            except OSError:  # closed meanwhile
+                continue
+            if not stat.S_ISSOCK(about.st_mode):
+                continue
+            found[number] = about.st_ino
+            if self._known.get(number) != about.st_ino:
+                changed += self._set(number)
+        self._known = found
+        return changed
+
+    def _set(self, number: int) -> bool:
+        handle = _taken(number)
+        if handle is None:
+            return False
+        with handle:
+            if handle.family not in (socket.AF_INET, socket.AF_INET6) or handle.type != socket.SOCK_STREAM:
+                return False
+            try:
+                handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, self._lease_ms)
+            except OSError:
+                return False
+        return True
+
+    def shut(self, ends: Set[tuple[Address, Address]]) -> int:
+        """Break the TCP connections with these (local, remote) ends and no others; returns how many.
+
+        Zenoh makes its links anew at once.
+        """
+        with contextlib.suppress(OSError):
+            self.look()
+        broken = 0
+        for number in self._known:
+            handle = _taken(number)
+            if handle is None:
+                continue
+            with contextlib.suppress(OSError), handle:
+                if handle.family not in (socket.AF_INET, socket.AF_INET6) or handle.type != socket.SOCK_STREAM:
+                    continue
+                # A listening socket has no other end: the question for it raises.
+                if (_address(handle.getsockname()), _address(handle.getpeername())) in ends:
+                    handle.shutdown(socket.SHUT_RDWR)
+                    broken += 1
+        return broken
+
+    def close(self) -> None:
+        """One session less; look no more once there is none."""
+        self._users -= 1
+        if self._users == 0 and self._task is not None:
+            self._task.cancel()
+            self._running.pop(self._task.get_loop(), None)
+
+
+def _taken(number: int) -> socket.socket | None:
+    """A descriptor's socket, by a copy of the descriptor; None when it is none any more.
+
+    Zenoh's threads close sockets at any time, and the number may be a file's by now.
+    """
+    try:
+        copy = os.dup(number)
+    except OSError:
+        return None
+    try:
+        return socket.socket(fileno=copy)
+    except OSError:
+        os.close(copy)
+        return None
+
+
+def address_of(locator: str) -> Address | None:
+    """The address in a Zenoh locator such as `tcp/127.0.0.1:7447`; None for one that is no address."""
+    try:
+        parts = urlsplit(f"//{locator.partition('/')[2].partition('?')[0].partition('#')[0]}")
+        return None if parts.hostname is None or parts.port is None else _address((parts.hostname, parts.port))
+    except ValueError:
+        return None
+
+
+def _address(name: Any) -> Address:
+    """A socket's name as an address; IPv4 in an IPv6 socket is IPv4. ValueError when it is none."""
+    host = ipaddress.ip_address(str(name[0]).partition("%")[0])
+    mapped = host.ipv4_mapped if isinstance(host, ipaddress.IPv6Address) else None
+    return str(mapped or host), int(name[1])
+
+
+# pyright: reportUnknownMemberType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
 
 log = structlog.get_logger(__name__)
 
@@ -143,7 +339,7 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
         "listen/endpoints": list(config.listen),
         "listen/exit_on_failure": True,
         "listen/timeout_ms": 0,
-        "connect/endpoints": [*config.connect, *dialling.dialled(gateway, config.peers)],
+        "connect/endpoints": [*config.connect, *dialled(gateway, config.peers)],
         # Peers look for each other for ever in the background, so gateways may start in any order.
         "connect/timeout_ms": int(config.connect_timeout_s * 1e3) if client else -1,
         "connect/exit_on_failure": client,
@@ -177,7 +373,7 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
     }
     if config.mode == "peer" and config.listen:
         table = bool(set(config.peers) - {gateway})
-        settings["id"] = dialling.session_id(gateway, naming=bool(config.connect) and not table)
+        settings["id"] = session_id(gateway, naming=bool(config.connect) and not table)
         # Nobody can dial a peer that does not listen: that one dials all.
         settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
         if table:

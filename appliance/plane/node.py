@@ -1,4 +1,14 @@
-"""One gateway's part in the plane, or a client's: session, RPC, membership, records and registry put together."""
+"""What takes part in the plane: a gateway (`Plane`), a client (`PlaneClient`) and a router (`run_router`).
+
+A gateway's part is session, RPC, membership, records, leases and registry put together; a client asks any gateway.
+
+A router is what a large fleet's gateways are clients of, so that they need no links with each other. A few gateways
+link as peers, each with each. Beyond some thirty that costs too much memory and descriptors; there, three to five
+routers are linked sparsely (a line or a star: link state does not scale in dense graphs), and every gateway is a
+client of those near it (`plane.mode = "client"`). A router holds no records and no place on the ring: gateways are
+addressed by key and the routers find the way, so any of them can be restarted at any time. Eclipse Zenoh's own
+`zenohd` does the same; this one needs nothing that a gateway does not have.
+"""
 
 import asyncio
 import contextlib
@@ -10,18 +20,15 @@ from pathlib import Path
 
 import structlog
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError
-from appliance.plane.browsing import Browsing
-from appliance.plane.dht import Dht
-from appliance.plane.dialling import dialled
+from appliance.plane.anti_entropy import Reconciler
+from appliance.plane.dht import Browsing, Dht
 from appliance.plane.keys import Keys, check_name
-from appliance.plane.membership import Membership
-from appliance.plane.namesake import displaced
-from appliance.plane.outlived import Outlived
-from appliance.plane.pulse import Pulse
+from appliance.plane.link import dialled
+from appliance.plane.membership import Membership, Outlived, StallDetector, displaced
 from appliance.plane.quorum import Leases
-from appliance.plane.reconcile import Reconciler
 from appliance.plane.registry import Registry
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
@@ -73,7 +80,7 @@ class Plane:
         self.rpc = Rpc(session, gateway)
         self._membership = Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
         self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
-        self._pulse = Pulse(config.lease_ms / 1e3)
+        self._pulse = StallDetector(config.lease_ms / 1e3)
         self._outlived = Outlived(
             self._pulse,
             lease_s=config.lease_ms / 1e3,
@@ -395,3 +402,38 @@ class PlaneClient:
         self._membership.close()
         await self.registry.close()
         await self.session.close()
+
+
+_ROUTER_FLEET = "router"
+"""A session belongs to a fleet by the keys it uses; a router uses none, and routes for all fleets."""
+_ROUTER_LOOK_S = 1.0
+
+
+async def run_router(
+    config: PlaneConfig, *, stop: asyncio.Event, ready: Callable[[Session], None], alive: Callable[[], None]
+) -> None:
+    """Route until `stop`. `ready` is called once it listens, `alive` about every second after that.
+
+    Raises:
+        ConfigError: there is nothing to listen on, or it is in use.
+    """
+    if not config.listen:
+        raise ConfigError("a router has nothing to listen on", remedy="give --listen, such as tcp/0.0.0.0:7447")
+    session = await Session.open(replace(config, mode="router"), _ROUTER_FLEET)
+    try:
+        log.info("routing", listen=config.listen, connect=config.connect)
+        ready(session)
+        linked = -1
+        while not stop.is_set():
+            alive()
+            if session.linked != linked:
+                linked = session.linked
+                log.info("linked", routers_and_peers=linked)
+            try:
+                async with asyncio.timeout(_ROUTER_LOOK_S):
+                    await stop.wait()
+            except TimeoutError:
+                continue
+    finally:
+        await session.close()
+    log.info("stopped")

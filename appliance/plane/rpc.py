@@ -14,8 +14,7 @@ from msgspec import Raw, Struct
 
 from appliance.errors import ConfigError, PayloadError, SwiftbotError
 from appliance.model import ErrorReply, encode
-from appliance.plane.asking import Question
-from appliance.plane.session import Session
+from appliance.plane.session import Question, Session
 
 Q = TypeVar("Q", bound=Struct)
 R = TypeVar("R", bound=Struct)

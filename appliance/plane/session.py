@@ -1,34 +1,1134 @@
-"""The one thin wrapper around a Zenoh session: nothing else in the product touches the library.
+"""The thin wrapper around a Zenoh session: put, subscribe, query, serve, liveliness.
 
-It exists to keep three promises. Every callback runs on the event loop's thread. Every payload that arrives is
-bounded, and one that is malformed or oversize is counted, logged and dropped or answered with an ErrorReply.
-Nothing that is sent can hang the loop: sends block when a peer is stuck (dropping would lose facts silently), but
-they do so on a thread of their own, and a peer stuck for a lease is disconnected.
+It exists to keep three promises. What a subscriber or handler is called with comes on the event loop's thread (a filter
+and `Flood` alone run on threads of their own). Every payload that arrives is bounded, and one that is malformed or
+oversize is counted, logged and dropped or answered with an ErrorReply. Nothing that is sent can hang the loop: sends
+block when a peer is stuck (dropping would lose facts silently), but they do so on a thread of their own, and a peer
+stuck for a lease is disconnected.
 
-Its parts are `publishing` (facts), `answering` and `asking` (questions), `presence` (liveliness tokens) and `doors`
-(links that are mixed up), each around the same `wire`.
+`Session` puts its parts together, each around the same `Wire`, which has the library's session and the two queues to
+and from its threads, `Inbox` and `Outbox`:
+
+- `Publishing`: facts that are put for whoever listens; `Flood` for whoever must keep up with all of them,
+- `Presence`: liveliness tokens,
+- `Answering` and `Verbs`: questions of others, each in a task of its own, bounded; every defect of a handler ends here,
+- `Asking`: questions to whoever serves a key, or to everybody: bounded in time and size, and over when the session is,
+- `Doors`: which links are made anew when questions arrive at wrong doors.
+
+**Wrong doors.** After links were made anew Zenoh 1.10 has been seen to deliver questions to the wrong queryable, for
+good: the two ends of a link disagree about which number stands for which key (zenoh issue 1886). Whoever is asked
+refuses such a question, and a new link mends it. But anybody may attach a wrong key to a question, or answer that a
+door is the wrong one, and say that it is somebody else. So nobody's word breaks a link that others use:
+
+- whoever *asked*, and is linked to the one that answered, makes just that link anew. The one that was asked does
+  nothing: the link is the same, and the asker has no doubt about what it meant.
+- where there is something between the two, the link that is mixed up is not known. Then all of Zenoh's links of this
+  process are made anew, but only when two different sessions have met a wrong door here within a minute: one is not
+  believed, and an attempt that fails for such a reason is made by another gateway next.
+- whoever *finds by itself* that links of its own cannot be right (`membership.Outlived`) makes all of them anew: nobody
+  said so.
+
+**One queryable for all verbs.** Among peers all verbs of a gateway are behind one queryable, `gw/{gateway}/rpc/*`;
+behind a router there is one for each. A queryable for each would be some eighty of a gateway, and Zenoh tells every
+session of each and compares every key with all of them: with eight gateways on two cores one that was restarted showed
+its token 30 ms after its session was open, and 19 ms with one queryable. With 300 members behind one router, though,
+three of four fleets with one queryable each never came to rest: some members were seen, but nothing they said was heard
+(docs/benchmarks.md). Why is not known; of ten with a queryable for each verb all did. The recorder and other clients of
+Zenoh see no difference: the keys are the same.
 """
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, Generic, TypeVar, cast
+
+import msgspec
+import structlog
+import zenoh
+from msgspec import Struct
+
+from appliance.errors import DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.plane import link
+from appliance.plane.backlog import Backlog
+from appliance.plane.keys import Keys
+from appliance.plane.link import CALM_S, SocketWatch, address_of
+from appliance.plane.settings import PlaneConfig
+
+log = structlog.get_logger(__name__)
+
+_INBOX_TURN = 256
+"""Deliveries per turn of the loop, so that a flood does not starve everything else."""
+
+
+class Inbox:
+    """Calls from any thread to the event loop's thread, in order; one wake-up however many wait.
+
+    `on_dropped` is told on the loop's thread how many were dropped, once the burst is over.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        messages: int,
+        payload_bytes: int,
+        on_dropped: Callable[[int], None] | None = None,
+    ) -> None:
+        self._loop = loop
+        self._on_dropped = on_dropped
+        self._told = 0
+        self._most, self._most_bytes = messages, payload_bytes
+        self._waiting: deque[tuple[Callable[[], None], int]] = deque()
+        self._bytes = 0
+        self._woken = False
+        self._lock = threading.Lock()
+        self._closed = False
+        self.dropped = 0
+
+    def post(self, call: Callable[[], None], size: int = 0, *, must: bool = False) -> bool:
+        """Queue a call; False when it was dropped. `must` is for the few that are never many (ends of queries)."""
+        with self._lock:
+            if self._closed:
+                return False
+            if not must and (len(self._waiting) >= self._most or self._bytes + size > self._most_bytes):
+                self.dropped += 1
+                return False
+            self._waiting.append((call, size))
+            self._bytes += size
+            wake, self._woken = not self._woken, True
+        if wake:
+            self._wake()
+        return True
+
+    def _wake(self) -> None:
+        try:
+            self._loop.call_soon_threadsafe(self._deliver)
+        except RuntimeError:  # the loop was closed without closing the session: nobody is left to deliver to
+            self.close()
+
+    def _deliver(self) -> None:
+        for _ in range(_INBOX_TURN):
+            with self._lock:
+                if not self._waiting:
+                    self._woken = False
+                    break
+                call, size = self._waiting.popleft()
+                self._bytes -= size
+            try:
+                call()
+            except Exception:  # supervision boundary: one receiver's defect must not end the others' deliveries
+                log.exception("a receiver failed")
+        else:
+            self._loop.call_soon(self._deliver)
+            return
+        dropped = self.dropped
+        if dropped > self._told and self._on_dropped is not None:
+            self._on_dropped(dropped - self._told)
+        self._told = dropped
+
+    def close(self) -> None:
+        """Forget what waits and take no more."""
+        with self._lock:
+            self._closed = True
+            self._waiting.clear()
+
+
+class Outbox:
+    """Sends in order on a thread of its own, so that a stuck peer holds up that thread and never the loop."""
+
+    def __init__(self, *, messages: int, payload_bytes: int) -> None:
+        self._most, self._most_bytes = messages, payload_bytes
+        self._waiting: deque[tuple[Callable[[], None], int]] = deque()
+        self._bytes = 0
+        self._some = threading.Condition()
+        self._closed = False
+        self.dropped = 0
+        self._thread = threading.Thread(target=self._run, name="zenoh sender", daemon=True)
+        self._thread.start()
+
+    def send(self, call: Callable[[], None], size: int) -> bool:
+        """Queue a send; False when it was dropped because the queue is full."""
+        with self._some:
+            if self._closed or len(self._waiting) >= self._most or self._bytes + size > self._most_bytes:
+                self.dropped += 1
+                return False
+            self._waiting.append((call, size))
+            self._bytes += size
+            self._some.notify()
+        return True
+
+    @property
+    def waiting(self) -> int:
+        """Sends that wait."""
+        return len(self._waiting)
+
+    def _run(self) -> None:
+        while True:
+            with self._some:
+                while not self._waiting:
+                    if self._closed:
+                        return
+                    self._some.wait()
+                call, size = self._waiting.popleft()
+            try:
+                call()
+            except Exception:  # supervision boundary: one failed send must not end the others
+                log.exception("a send failed")
+            with self._some:
+                self._bytes -= size
+
+    def close(self, timeout_s: float) -> None:
+        """Send what waits, for at most that long. Blocks; call it off the loop."""
+        with self._some:
+            self._closed = True
+            self._some.notify()
+        self._thread.join(timeout_s)
+        with self._some:
+            self._waiting.clear()
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+
+class Closer:
+    """Ends a subscription, service or token; more than once does no harm."""
+
+    def __init__(self, end: Callable[[], None]) -> None:
+        self._end: Callable[[], None] | None = end
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was ended; what was under way to the loop then is not delivered any more."""
+        return self._end is None
+
+    def close(self) -> None:
+        """End it."""
+        end, self._end = self._end, None
+        if end is not None:
+            # An entity of a closed session is gone already.
+            with contextlib.suppress(zenoh.ZError):
+                end()
+
+
+class Wire:
+    """A Zenoh session with its queues; `plane.session` makes and closes it."""
+
+    def __init__(self, config: PlaneConfig, fleet: str, raw: zenoh.Session, loop: asyncio.AbstractEventLoop) -> None:
+        self.config = config
+        self.keys = Keys(fleet)
+        self.raw = raw
+        self.source = zenoh.SourceInfo(raw.id, 0)
+        """What questions of this session say of where they come from."""
+        self.backlog = Backlog(payload_bytes=config.backlog_bytes, seconds=config.backlog_s)
+        """What this session has put lately."""
+        self.loop = loop
+        self.refused: dict[str, int] = {}
+        self.closed = False
+        self.inbox = Inbox(
+            loop,
+            messages=config.queue_messages,
+            payload_bytes=config.queue_bytes,
+            on_dropped=lambda count: self.refuse("incoming queue full", count=count),
+        )
+        self.outbox = self._new_outbox()
+        self._bulk: Outbox | None = None
+        """Of its own, so that facts and orders never wait behind a volume on a slow link."""
+
+    def _new_outbox(self) -> Outbox:
+        return Outbox(messages=self.config.queue_messages, payload_bytes=self.config.queue_bytes)
+
+    def send(self, key: str, send: Callable[[], None], size: int, *, bulk: bool = False) -> bool:
+        """Have the sender's thread send; False when it does not fit into its queue, which is counted."""
+        outbox = self.outbox
+        if bulk:
+            outbox = self._bulk = self._bulk or self._new_outbox()
+        queued = outbox.send(partial(link.quietly, send, key), size)
+        if not queued and not self.closed:
+            self.refuse("outgoing queue full", key=key)
+        return queued
+
+    def refuse(self, what: str, *, count: int = 1, **fields: Any) -> None:
+        """Count bad input; logged the first ten times, then at powers of two: a flood does not fill the log."""
+        before = self.refused.get(what, 0)
+        total = self.refused[what] = before + count
+        if total <= 10 or before.bit_length() != total.bit_length():
+            fields = {key: value[:300] if isinstance(value, str) else value for key, value in fields.items()}
+            log.warning("refused", what=what, count=total, **fields)
+
+    def name(self, expr: str) -> str:
+        """A key without the fleet's root, for counts."""
+        return expr.removeprefix(f"{self.keys.root}/")
+
+    async def close(self, timeout_s: float) -> None:
+        """Send what waits, for at most so long each queue, and close the library's session."""
+        await asyncio.to_thread(self.outbox.close, timeout_s)
+        if self._bulk is not None:
+            await asyncio.to_thread(self._bulk.close, timeout_s)
+        await asyncio.to_thread(self.raw.close)
+
+
+# pyright: reportUnknownMemberType=false
+
+
+WITNESS_S = 60.0
+"""Within so long a second session must have met a wrong door, for links that are not known to be the ones."""
+WITNESSES = 2
+_MOST_KNOWN = 64
+_AFTER_ANSWER_S = 0.05
+"""Before links are broken, for answers that are on their way over them."""
+
+
+class Mixups:
+    """Decides when links are made anew. Pure; times are seconds of one monotonic clock."""
+
+    def __init__(self) -> None:
+        self._seen: OrderedDict[str, float] = OrderedDict()
+        """Session of the other side -> when it last met a wrong door here, with something between."""
+        self._broken: OrderedDict[str, float] = OrderedDict()
+        """Session at the other end of a link -> when that was made anew; "" for all links."""
+
+    def direct(self, other: str, now: float) -> bool:
+        """Whether the link with a session is to be made anew, that answered a question of ours as not its own."""
+        return self._calm(other, now)
+
+    def relayed(self, other: str, now: float) -> bool:
+        """Whether all links are, after a wrong door between this session and another that it has no link with."""
+        if not other:
+            return False  # nobody's word
+        self._seen[other] = now
+        self._seen.move_to_end(other)
+        while len(self._seen) > _MOST_KNOWN or now - next(iter(self._seen.values())) > WITNESS_S:
+            self._seen.popitem(last=False)
+        if len(self._seen) < WITNESSES or not self._calm("", now):
+            return False
+        self._seen.clear()
+        return True
+
+    def renewed(self, now: float) -> None:
+        """All links are made anew, for another reason."""
+        self._broken[""] = now
+        self._seen.clear()
+
+    def _calm(self, link: str, now: float) -> bool:
+        if now < self._broken.get(link, -CALM_S) + CALM_S:
+            return False
+        self._broken[link] = now
+        self._broken.move_to_end(link)
+        while len(self._broken) > _MOST_KNOWN:
+            self._broken.popitem(last=False)
+        return True
+
+
+class Doors:
+    """Makes the links of one session anew when `Mixups` says so; called on the event loop's thread."""
+
+    def __init__(self, wire: Wire, sockets: SocketWatch) -> None:
+        self._wire = wire
+        self._sockets = sockets
+        self._mixups = Mixups()
+
+    def was_wrong(self, asker: str) -> None:
+        """A question came here that was meant for another key; `asker`: the session that it says it is of."""
+        if not self._links(asker) and self._mixups.relayed(asker, self._wire.loop.time()):
+            self._soon("")
+
+    def met_wrong(self, replier: str) -> None:
+        """A question of ours was answered by a session, which says it was meant for another key."""
+        if self._links(replier):
+            if self._mixups.direct(replier, self._wire.loop.time()):
+                self._soon(replier)
+        elif self._mixups.relayed(replier, self._wire.loop.time()):
+            self._soon("")
+
+    def renew(self, why: str) -> None:
+        """Make all links anew; `why` is for the log."""
+        self._mixups.renewed(self._wire.loop.time())
+        self._break("", why)
+
+    def _links(self, other: str) -> list[tuple[str, str]]:
+        """Ends of the links with a session, or of all for the empty name."""
+        if self._wire.closed:
+            return []
+        found = self._wire.raw.info.links()
+        return [(each.src, each.dst) for each in found if not other or str(each.zid) == other]
+
+    def _soon(self, other: str) -> None:
+        self._wire.loop.call_later(_AFTER_ANSWER_S, self._break, other, "questions arrived at wrong doors")
+
+    def _break(self, other: str, why: str) -> None:
+        ends = [(address_of(one), address_of(another)) for one, another in self._links(other)]
+        broken = self._sockets.shut({(one, another) for one, another in ends if one and another})
+        if broken:
+            log.warning("links are made anew", why=why, links=broken, other=other or "all")
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+
+
+T = TypeVar("T")
+
+FLOOD_QUEUED = 16_384
+"""Messages that Zenoh queues: a third of a second at 50,000 a second."""
+_FLOOD_BATCH = 2_048
+_FLOOD_REST_S = (0.001, 0.02)
+"""After nothing was there: first so long, doubled up to that. A log may be so late, a decision might not."""
+_FLOOD_END_S = 5.0
+
+
+class Flood(Generic[T]):
+    """A subscription that is drained by a thread of its own.
+
+    Args:
+        raw: the Zenoh session.
+        expr: what to hear.
+        make: makes a message of key, time (Unix nanoseconds of the sender's clock, or of arrival without one), payload,
+            Zenoh encoding, whether it is a deletion, and the session and number it has there (`plane.backlog`; "" and 0
+            where the sender does not say).
+        take: gets batches, in order, on the draining thread; must not block.
+        limit: payload bytes beyond which a message is not taken.
+        on_oversize: told key and size of such a one, on the draining thread.
+    """
+
+    def __init__(
+        self,
+        raw: zenoh.Session,
+        expr: str,
+        *,
+        make: Callable[[str, int, bytes, str, bool, str, int], T],
+        take: Callable[[list[T]], None],
+        limit: int,
+        on_oversize: Callable[[str, int], None],
+    ) -> None:
+        self._make, self._take = make, take
+        self._limit, self._on_oversize = limit, on_oversize
+        self._ending = threading.Event()
+        self._encodings: dict[Any, str] = {}
+        self._subscriber = raw.declare_subscriber(expr, zenoh.handlers.FifoChannel(FLOOD_QUEUED))
+        self._thread = threading.Thread(target=self._run, name="flood", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Hand over what is there and end."""
+        self._ending.set()
+        self._thread.join(_FLOOD_END_S)
+        with contextlib.suppress(zenoh.ZError):  # gone with its session
+            self._subscriber.undeclare()
+
+    def _run(self) -> None:
+        receive, rest_s = self._subscriber.handler.try_recv, _FLOOD_REST_S[0]
+        while True:
+            ending = self._ending.is_set()
+            batch: list[T] = []
+            try:
+                while len(batch) < _FLOOD_BATCH and (sample := receive()) is not None:
+                    self._add(sample, batch)
+            except zenoh.ZError:  # the session was closed under it
+                ending = True
+            if batch:
+                try:
+                    self._take(batch)
+                except Exception:  # supervision boundary: one receiver's defect must not stop the queue
+                    log.exception("a receiver failed")
+                rest_s = _FLOOD_REST_S[0]
+            elif ending:
+                return
+            else:
+                self._ending.wait(rest_s)
+                rest_s = min(_FLOOD_REST_S[1], rest_s * 2)
+
+    def _add(self, sample: zenoh.Sample, batch: list[T]) -> None:
+        payload, stamp = sample.payload, sample.timestamp
+        key = str(sample.key_expr)
+        if len(payload) > self._limit:
+            self._on_oversize(key, len(payload))
+            return
+        at_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns()
+        deleted = sample.kind == zenoh.SampleKind.DELETE
+        info = sample.source_info
+        source, number = (f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn) if info is not None else ("", 0)
+        batch.append(self._make(key, at_ns, payload.to_bytes(), str(sample.encoding), deleted, source, number))
+
+
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
-import asyncio
-from functools import partial
 
-import zenoh
+class Message(Struct, frozen=True):
+    """A put or delete as it arrived. `at_ns` is the sender's hybrid logical clock, Unix nanoseconds."""
 
-from appliance.plane import link
-from appliance.plane.answering import Answering
-from appliance.plane.asking import Asking
-from appliance.plane.doors import Doors
-from appliance.plane.keys import Keys
-from appliance.plane.presence import Presence
-from appliance.plane.publishing import Message, Publishing
-from appliance.plane.settings import PlaneConfig
-from appliance.plane.sockets import SocketWatch
-from appliance.plane.verbs import Verbs
-from appliance.plane.wire import Closer, Wire
+    key: str
+    payload: bytes
+    deleted: bool
+    at_ns: int
+    encoding: str
 
-__all__ = ["Closer", "Message", "Session"]
+
+class Publishing:
+    """Facts out and in of one session."""
+
+    def __init__(self, wire: Wire, on_first: Callable[[], None] = lambda: None) -> None:
+        """`on_first` is called on the sender's thread before the first put."""
+        self._wire = wire
+        self._on_first = on_first
+        self._recorded = f"{wire.keys.root}/"
+
+    def put(self, key: str, payload: bytes, *, encoding: str = "application/json", express: bool = False) -> None:
+        """Publish; returns at once. What cannot be sent (too large, queue full) is counted and logged.
+
+        `express`: at once, and what waits before it with it. Others may wait for a millisecond on each link for more
+        to go in one packet, where something was sent just before.
+        """
+        if len(payload) > self._wire.config.max_payload_bytes:
+            self._wire.refuse("oversize put", key=key, size=len(payload))
+            return
+        self._send(key, payload, encoding=encoding, express=express)
+
+    def delete(self, key: str) -> None:
+        """Publish that a key's fact is gone."""
+        self._send(key, None)
+
+    def _send(self, key: str, payload: bytes | None, *, encoding: str = "", express: bool = False) -> None:
+        say = partial(self._say, key, payload, encoding, express)
+        if not self._wire.send(key, say, len(payload or b"")) and self._is_recorded(key):
+            self._wire.backlog.not_sent(key)
+
+    def _is_recorded(self, key: str) -> bool:
+        """Whether recorders subscribe to a key: they cannot miss what no wildcard matches."""
+        return key.startswith(self._recorded) and "/@" not in key
+
+    def _say(self, key: str, payload: bytes | None, encoding: str, express: bool) -> None:
+        """Put, or delete where there is no payload, with number and time of its own; on the sender's thread."""
+        raw, backlog = self._wire.raw, self._wire.backlog
+        stamp, source = raw.new_timestamp(), None
+        if self._is_recorded(key):
+            if not backlog.last:
+                self._on_first()
+            at_ns = stamp.get_time_as_ntp64().as_nanos()
+            number = backlog.say(key, at_ns, payload or b"", encoding, deleted=payload is None)
+            source = zenoh.SourceInfo(self._wire.source.source_id, number)
+        block = zenoh.CongestionControl.BLOCK
+        if payload is None:
+            raw.delete(key, congestion_control=block, timestamp=stamp, source_info=source)
+        else:
+            raw.put(
+                key,
+                payload,
+                encoding=encoding,
+                congestion_control=block,
+                express=express,
+                timestamp=stamp,
+                source_info=source,
+            )
+
+    def subscribe(
+        self, expr: str, callback: Callable[[Message], None], *, heed: Callable[[str], bool] = lambda _: True
+    ) -> Closer:
+        """Have every put and delete under `expr` delivered, as bytes; oversize ones are counted and dropped.
+
+        `heed` is asked first, on a thread of Zenoh's, whether a key is anybody's business here: what is not does not
+        wake the event loop. It must neither block nor go through what the event loop changes meanwhile.
+        """
+        name, limit = self._wire.name(expr), self._wire.config.max_payload_bytes
+
+        def take(sample: zenoh.Sample) -> None:
+            key, size = str(sample.key_expr), len(sample.payload)
+            if not heed(key):
+                return
+            if size > limit:
+                self._wire.inbox.post(partial(self._wire.refuse, f"oversize {name}", key=key, size=size))
+                return
+            stamp = sample.timestamp
+            message = Message(
+                key,
+                sample.payload.to_bytes(),
+                sample.kind == zenoh.SampleKind.DELETE,
+                stamp.get_time_as_ntp64().as_nanos() if stamp else time.time_ns(),
+                str(sample.encoding),
+            )
+            self._wire.inbox.post(partial(deliver, message), size)
+
+        def deliver(message: Message) -> None:
+            if not closer.closed:
+                callback(message)
+
+        subscriber = self._wire.raw.declare_subscriber(expr, link.callback(take))
+        closer = Closer(subscriber.undeclare)
+        return closer
+
+    def flood(
+        self, expr: str, make: Callable[[str, int, bytes, str, bool, str, int], T], take: Callable[[list[T]], None]
+    ) -> Closer:
+        """Have everything under `expr` delivered in batches, past the event loop, on a thread of its own (`Flood`).
+
+        Oversize messages are counted as those of a subscription are.
+        """
+        wire, name = self._wire, self._wire.name(expr)
+
+        def oversize(key: str, size: int) -> None:
+            wire.inbox.post(partial(wire.refuse, f"oversize {name}", key=key, size=size))
+
+        limit = wire.config.max_payload_bytes
+        return Closer(Flood(wire.raw, expr, make=make, take=take, limit=limit, on_oversize=oversize).close)
+
+    def subscribe_typed(
+        self,
+        expr: str,
+        kind: type[T],
+        callback: Callable[[str, T | None], None],
+        *,
+        wanted: Callable[[str], bool] = lambda _: True,
+        heed: Callable[[str], bool] = lambda _: True,
+    ) -> Closer:
+        """Have facts delivered decoded, None when one is deleted; malformed ones are counted, logged, dropped.
+
+        Those whose key is not `wanted` are not even decoded; `heed` as of `subscribe`.
+        """
+        decoder, name = msgspec.json.Decoder(kind), self._wire.name(expr)
+
+        def take(message: Message) -> None:
+            if not wanted(message.key):
+                return
+            if message.deleted:
+                callback(message.key, None)
+                return
+            try:
+                value = decoder.decode(message.payload)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                self._wire.refuse(f"malformed {name}", key=message.key, reason=str(error))
+                return
+            callback(message.key, value)
+
+        return self.subscribe(expr, take, heed=heed)
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+
+class Presence:
+    """The tokens of one session."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        self._tokens: set[zenoh.LivelinessToken] = set()
+
+    def declare_alive(self, key: str) -> Closer:
+        """Show a liveliness token until closed, or until this process dies."""
+        token = self._wire.raw.liveliness().declare_token(key)
+
+        def end() -> None:
+            self._tokens.discard(token)
+            token.undeclare()
+
+        # Kept here: unlike a subscription, a token that nobody holds is taken back by the garbage collector.
+        self._tokens.add(token)
+        return Closer(end)
+
+    async def alive_now(self, expr: str, *, timeout_s: float = 1.0) -> list[str]:
+        """Return the keys of the tokens that are there now; those that could be had in time."""
+        inbox = self._wire.inbox
+        found: list[str] = []
+        ended = asyncio.Event()
+
+        def take(reply: zenoh.Reply) -> None:
+            if (sample := reply.ok) is not None:
+                inbox.post(partial(found.append, str(sample.key_expr)), must=True)
+
+        ask = partial(
+            self._wire.raw.liveliness().get,
+            expr,
+            link.callback(take, drop=partial(inbox.post, ended.set, must=True)),
+            timeout=timeout_s,
+        )
+        self._wire.send(expr, cast("Callable[[], None]", ask), 0)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return sorted(found)
+
+    def watch_alive(self, expr: str, callback: Callable[[str, bool], None]) -> Closer:
+        """Have the coming (True) and going (False) of tokens delivered, those already there first."""
+        inbox = self._wire.inbox
+
+        def take(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            inbox.post(partial(deliver, str(sample.key_expr), alive), must=True)
+
+        def deliver(key: str, alive: bool) -> None:
+            if not closer.closed:
+                callback(key, alive)
+
+        # What comes before `closer` is bound waits in the inbox: it is delivered by a later turn of the loop.
+        handler = link.callback(take)
+        subscriber = self._wire.raw.liveliness().declare_subscriber(expr, handler, history=True)
+        closer = Closer(subscriber.undeclare)
+        return closer
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+
+Answer = Callable[[bytes | None, SwiftbotError | None], None]
+"""Answers one question, from any thread."""
+Handler = Callable[[str, bytes], Awaitable[bytes]]
+"""Answers a question for a key, on the event loop."""
+
+
+class Answering:
+    """What is served on one session."""
+
+    def __init__(self, wire: Wire, doors: Doors) -> None:
+        self.wire = wire
+        self._doors = doors
+        self._answering: set[asyncio.Task[None]] = set()
+
+    def serve(self, expr: str, handler: Handler, *, bulk: bool = False) -> Closer:
+        """Answer queries on `expr`, each in a task of its own, at most `concurrent_queries` at once.
+
+        `bulk`: answers are raw bytes and wait in a queue of their own; their priority is that of the question.
+
+        A SwiftbotError of the handler is answered as ErrorReply; any other exception is logged with its traceback
+        and answered as ErrorReply of code `internal`: this is where a handler's defects are contained.
+
+        A question that was meant for another key is refused as `unreachable`: after links were made anew Zenoh 1.10 has
+        been seen to deliver a query to the wrong queryable of a session or process, which made one robot do another's
+        command. `query` writes down for whom it is; what other Zenoh clients ask says nothing of it.
+        """
+        served = Served(self, expr, handler, bulk=bulk)
+        queryable = self.wire.raw.declare_queryable(expr, link.callback(served.take), complete=True)
+        return Closer(queryable.undeclare)
+
+    def begin(self, served: "Served", key: str, data: bytes, reply: Answer) -> None:
+        """Have a handler answer, unless too many are at it; on the event loop's thread."""
+        if len(served.running) >= self.wire.config.concurrent_queries:
+            error = RefusedError(f"{key}: {len(served.running)} queries are being answered", remedy="try again later")
+            self.refuse(f"too many {served.name}", key, reply, error)
+            return
+        task = self.wire.loop.create_task(self._answer(served.handler, served.name, key, data, reply))
+        for group in (served.running, self._answering):
+            group.add(task)
+            task.add_done_callback(group.discard)
+
+    async def _answer(
+        self,
+        handler: Handler,
+        name: str,
+        key: str,
+        data: bytes,
+        reply: Answer,
+    ) -> None:
+        answer: bytes | None = None
+        error: SwiftbotError | None = None
+        try:
+            answer = await handler(key, data)
+            if len(answer) > self.wire.config.max_payload_bytes:
+                error = PayloadError(f"{key}: the answer has {len(answer):,} bytes", remedy="ask for less at once")
+        except SwiftbotError as refusal:
+            if isinstance(refusal, PayloadError):
+                self.wire.refuse(f"malformed {name}", key=key, reason=str(refusal))
+            error = refusal
+        except asyncio.CancelledError:
+            error = UnreachableError("whoever was asked is stopping", remedy="ask another gateway")
+            raise
+        except Exception as defect:  # the supervision boundary of `serve`
+            log.exception("a query's handler failed", key=key)
+            error = SwiftbotError(f"{type(defect).__name__}: {defect}")
+        finally:
+            reply(answer, error)
+
+    def reply(
+        self, query: zenoh.Query, expr: str, bulk: bool, marked: bool, answer: bytes | None, error: SwiftbotError | None
+    ) -> None:
+        """Answer a query; one marked as direct from here, others on the sender's thread."""
+        if self.wire.closed:
+            link.reply(query, expr, answer, error)
+        elif marked:
+            link.reply_direct(query, expr, answer, error)
+        else:
+            size = len(answer) if answer is not None and error is None else 0
+            self.wire.send(expr, partial(link.reply, query, expr, answer, error, bulk=bulk), size, bulk=bulk)
+
+    def misrouted(self, name: str, expr: str, asker: str, reply: Answer, error: SwiftbotError) -> None:
+        """Refuse a question for another key; the links over which it came may be mixed up."""
+        self.refuse(f"misrouted {name}", expr, reply, error)
+        self._doors.was_wrong(asker)
+
+    def refuse(self, what: str, key: str, reply: Answer, error: SwiftbotError) -> None:
+        """Refuse a question as bad input, which is counted."""
+        self.wire.refuse(what, key=key, reason=str(error))
+        reply(None, error)
+
+    async def stop(self, wait_s: float) -> None:
+        """End every answer under way with an error, waiting at most so long for handlers that tidy up."""
+        for task in tuple(self._answering):
+            task.cancel()
+        if self._answering:
+            await asyncio.wait(self._answering, timeout=wait_s)
+
+
+class Served:
+    """What answers the questions for one key, or for those of an expression; `take`, on Zenoh's threads, has them."""
+
+    def __init__(self, answering: Answering, expr: str, handler: Handler, *, bulk: bool = False) -> None:
+        self.expr, self.handler = expr, handler
+        self.name = answering.wire.name(expr)
+        self.running: set[asyncio.Task[None]] = set()
+        self._answering, self._wire = answering, answering.wire
+        self._door = None if "*" in expr else expr.encode()
+        self._bulk = bulk
+
+    def take(self, query: zenoh.Query) -> None:
+        """A question came."""
+        self.take_marked(query, *link.read_mark(query))
+
+    def take_marked(self, query: zenoh.Query, marked: bool, meant: bytes) -> None:
+        """The same, with what it says of itself read (`link.read_mark`)."""
+        answering, limit = self._answering, self._wire.config.max_payload_bytes
+        payload = query.payload
+        size = len(payload) if payload is not None else 0
+        reply = partial(answering.reply, query, self.expr, self._bulk, marked)
+        if meant and self._door is not None and meant != self._door:
+            error = UnreachableError(f"{self.expr}: {link.WRONG_DOOR}", remedy="ask again in a moment")
+            begin = partial(answering.misrouted, self.name, self.expr, link.asker_of(query), reply, error)
+            size = 0
+        elif size > limit:
+            error = PayloadError(f"{query.key_expr}: {size:,} bytes", remedy=f"at most {limit:,}")
+            begin = partial(answering.refuse, f"oversize {self.name}", str(query.key_expr), reply, error)
+            size = 0
+        else:
+            data = payload.to_bytes() if payload is not None else b""
+            begin = partial(answering.begin, self, str(query.key_expr), data, reply)
+        if not self._wire.inbox.post(begin, size):
+            link.reply(query, self.expr, None, RefusedError("too busy", remedy="try again in a moment"))
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+
+class Verbs:
+    """The verbs of `expr`, which ends in `/*`; one that is not there is answered as where nobody is."""
+
+    def __init__(self, answering: Answering, expr: str) -> None:
+        self._answering = answering
+        self._prefix = expr.removesuffix("*")
+        self._served: dict[str, Served] = {}
+        self._nobody = Served(answering, expr, _nobody)
+        self._wrong = Served(answering, self._prefix.removesuffix("/"), _nobody)
+        self._closers: list[Closer] = []
+        self._one = answering.wire.config.mode == "peer"
+        if self._one:
+            queryable = answering.wire.raw.declare_queryable(expr, link.callback(self._take), complete=True)
+            self._closers.append(Closer(queryable.undeclare))
+
+    def add(self, verb: str, handler: Handler) -> None:
+        """Answer a verb from now on."""
+        expr = f"{self._prefix}{verb}"
+        if self._one:
+            self._served[verb] = Served(self._answering, expr, handler)
+        else:
+            self._closers.append(self._answering.serve(expr, handler))
+
+    def _take(self, query: zenoh.Query) -> None:
+        marked, meant = link.read_mark(query)
+        key = str(query.key_expr)
+        served = self._served.get(key.rpartition("/")[2])
+        if served is None:
+            # Other clients of Zenoh do not write down what they mean.
+            served = self._nobody if not meant or meant == key.encode() else self._wrong
+        served.take_marked(query, marked, meant)
+
+    def close(self) -> None:
+        """Answer no more."""
+        for closer in self._closers:
+            closer.close()
+
+
+async def _nobody(key: str, payload: bytes) -> bytes:
+    del payload
+    raise UnreachableError(f"nobody answers on {key}", remedy=link.NOBODY_REMEDY)
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
+
+MOST_ANSWERS = 2_000
+"""To one question that everybody may answer; twice the gateways that a fleet may have."""
+
+
+class Asking:
+    """The questions under way of one session."""
+
+    def __init__(self, wire: Wire, doors: Doors) -> None:
+        self._wire = wire
+        self._doors = doors
+        self.open: set[asyncio.Future[bytes]] = set()
+        """Answers that are awaited."""
+
+    async def query(
+        self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
+    ) -> bytes:
+        """Ask whoever serves a key and return the first answer; `bulk`: other messages go before it.
+
+        `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full. For small
+        questions that can be asked again, where the way there and back matters.
+
+        Raises:
+            UnreachableError: nobody serves the key, or (`sent`) whoever may have heard it went away before answering.
+            DeadlineError: no answer within `timeout_s` seconds.
+            PayloadError: the request or the answer is too large.
+            SwiftbotError: what the answering side raised.
+        """
+        return await self.ask(key, payload, timeout_s=timeout_s, bulk=bulk, direct=direct).answer()
+
+    def ask(
+        self, key: str, payload: bytes, *, timeout_s: float, bulk: bool = False, direct: bool = False
+    ) -> "Question":
+        """Do the same, but only send the question, and have the answer awaited afterwards."""
+        return Question(self, self._wire, key, payload, timeout_s, bulk=bulk, direct=direct)
+
+    async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
+        """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out.
+
+        At most `MOST_ANSWERS`, and `queue_bytes` of them together: what comes beyond that is counted as refused.
+        """
+        messages: list[Message] = []
+        ended = asyncio.Event()
+
+        def on_reply(key: str, data: bytes | None, error: SwiftbotError | None) -> None:
+            if data is not None:
+                messages.append(Message(key, data, deleted=False, at_ns=time.time_ns(), encoding="application/json"))
+            elif error is not None:
+                log.debug("an answer is an error", expr=expr, error=str(error))
+
+        self.get(expr, payload, timeout_s, on_reply, lambda _: ended.set(), target=zenoh.QueryTarget.ALL)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return list(messages)
+
+    async def answerers(self, key: str, payload: bytes, *, timeout_s: float) -> int:
+        """Ask everybody who serves a key, and return how many answered in time, whatever they said."""
+        found: set[str] = set()
+        ended = asyncio.Event()
+        inbox = self._wire.inbox
+
+        def take(reply: zenoh.Reply) -> None:
+            who = reply.replier_id
+            inbox.post(partial(found.add, f"{who.zid}/{who.eid}" if who is not None else f"{len(found)}"), must=True)
+
+        ask = partial(
+            self._wire.raw.get,
+            key,
+            link.callback(take, drop=partial(inbox.post, ended.set, must=True)),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=payload,
+        )
+        self._wire.send(key, cast("Callable[[], None]", ask), len(payload))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await ended.wait()
+        return len(found)
+
+    def get(
+        self,
+        expr: str,
+        payload: bytes,
+        timeout_s: float,
+        on_reply: Callable[[str, bytes | None, SwiftbotError | None], None],
+        on_end: Callable[[bool], None],
+        *,
+        target: zenoh.QueryTarget,
+        bulk: bool = False,
+        direct: bool = False,
+        meant: bytes | None = None,
+    ) -> None:
+        """Send a query; both callbacks come by the event loop, `on_end` only where no answer came first."""
+        first = target != zenoh.QueryTarget.ALL
+        limit = self._wire.config.max_payload_bytes
+        if len(payload) > limit:
+            raise PayloadError(f"a request of {len(payload):,} bytes on {expr}", remedy=f"at most {limit:,}")
+        if self._wire.closed:
+            raise UnreachableError("the session is closed")
+
+        answered, sender = False, 0
+        # One answer is all that counts of a question to one; whoever is asked may send more.
+        taken = _Bounds(1 if first else MOST_ANSWERS, self._wire.config.queue_bytes)
+
+        def take(reply: zenoh.Reply) -> None:
+            nonlocal answered
+            answered = True
+            sample = reply.ok
+            size = len(sample.payload) if sample is not None else 0
+            if not taken.one(0 if first or size > limit else size):
+                return
+            if sample is None:
+                error = link.error_of(reply.err)
+                if link.WRONG_DOOR in error.message:
+                    replier = str(reply.replier_id.zid) if reply.replier_id is not None else ""
+                    self._wire.inbox.post(partial(self._doors.met_wrong, replier))
+                self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
+            elif size > limit:
+                self._wire.inbox.post(partial(self._wire.refuse, "oversize answer", key=expr, size=size))
+                error = PayloadError(f"the answer on {expr} has {size:,} bytes", remedy=f"at most {limit:,}")
+                self._wire.inbox.post(partial(on_reply, expr, None, error), must=True)
+            else:
+                data = sample.payload.to_bytes()
+                key = expr if first else str(sample.key_expr)
+                self._wire.inbox.post(partial(on_reply, key, data, None), size, must=True)
+
+        def end() -> None:
+            if taken.left_out and not first:
+                refuse = partial(self._wire.refuse, "answers beyond the limit", count=taken.left_out, key=expr)
+                self._wire.inbox.post(refuse, must=True)
+            # Where the first answer is all that counts, waking the event loop for the end after it is for nothing.
+            if not (first and answered):
+                # One that nobody serves ends within the call that sends it.
+                self._wire.inbox.post(partial(on_end, sender != threading.get_ident()), must=True)
+
+        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
+        control = zenoh.CongestionControl
+        send = partial(
+            self._wire.raw.get,
+            expr,
+            link.callback(take, drop=end),
+            target=target,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            # Ours decides; Zenoh's only makes sure that nothing is kept for ever.
+            timeout=timeout_s + 1.0,
+            congestion_control=control.DROP if direct else control.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH if direct else priority,
+            express=True,
+            payload=payload,
+            attachment=meant,
+            source_info=self._wire.source,
+        )
+
+        def ask() -> None:
+            nonlocal sender
+            sender = threading.get_ident()
+            send()
+            sender = 0
+
+        if direct:
+            link.quietly(ask, expr)
+        else:
+            self._wire.send(expr, ask, len(payload))
+
+    def stop(self) -> None:
+        """End every question under way with an error."""
+        for answer in self.open:
+            if not answer.done():
+                answer.set_exception(UnreachableError("the session was closed", sent=True))
+
+
+class Question:
+    """A question that is under way; what went wrong with sending it is told with the answer."""
+
+    def __init__(
+        self,
+        asking: Asking,
+        wire: Wire,
+        key: str,
+        payload: bytes,
+        timeout_s: float,
+        *,
+        bulk: bool,
+        direct: bool,
+    ) -> None:
+        self._asking = asking
+        self._key, self._payload = key, payload
+        self._timeout_s, self._until = timeout_s, wire.loop.time() + timeout_s
+        self._bulk, self._direct = bulk, direct and len(payload) <= link.MOST_DIRECT
+        self._loop = wire.loop
+        self._answer: asyncio.Future[bytes] = wire.loop.create_future()
+        asking.open.add(self._answer)
+        self._timer = wire.loop.call_at(self._until, self._on_time)
+        try:
+            self._send()
+        except SwiftbotError as error:
+            self._answer.set_exception(error)
+
+    def _send(self) -> None:
+        self._asking.get(
+            self._key,
+            self._payload,
+            self._timeout_s,
+            self._on_reply,
+            self._on_end,
+            target=zenoh.QueryTarget.BEST_MATCHING,
+            bulk=self._bulk,
+            direct=self._direct,
+            meant=link.mark(self._key, direct=self._direct),
+        )
+
+    def _on_answer(self, data: bytes | None, error: SwiftbotError | None) -> None:
+        if not self._answer.done():
+            if error is not None:
+                self._answer.set_exception(error)
+            elif data is not None:
+                self._answer.set_result(data)
+
+    def _on_reply(self, _: str, data: bytes | None, error: SwiftbotError | None) -> None:
+        self._on_answer(data, error)
+
+    def _on_end(self, sent: bool) -> None:
+        self._on_answer(None, UnreachableError(f"nobody answers on {self._key}", remedy=link.NOBODY_REMEDY, sent=sent))
+
+    def _on_time(self) -> None:
+        self._on_answer(None, DeadlineError(f"no answer on {self._key} within {self._timeout_s:g} s"))
+
+    async def answer(self) -> bytes:
+        """Wait for the answer; errors as of `Asking.query`, whose time has run since the question was sent."""
+        try:
+            data = await self._answer
+            if data or not self._direct:
+                return data
+        finally:
+            self.end()
+        # The answer is too large to be sent so.
+        left_s = max(0.0, self._until - self._loop.time())
+        return await self._asking.query(self._key, self._payload, timeout_s=left_s, bulk=self._bulk)
+
+    def end(self) -> None:
+        """Wait for it no more; more than once does no harm."""
+        self._timer.cancel()
+        self._asking.open.discard(self._answer)
+        if not self._answer.cancel() and not self._answer.cancelled():
+            self._answer.exception()  # looked at: nobody else may come to
+
+
+class _Bounds:
+    """Counts the answers to one question, on whatever threads they come."""
+
+    def __init__(self, most: int, most_bytes: int) -> None:
+        self.left_out = 0
+        self._left, self._left_bytes = most, most_bytes
+        self._lock = threading.Lock()
+
+    def one(self, size: int) -> bool:
+        """Whether one more of that size is within the bounds."""
+        with self._lock:
+            if self._left <= 0 or self._left_bytes < size:
+                self.left_out += 1
+                return False
+            self._left -= 1
+            self._left_bytes -= size
+            return True
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# The library's stubs leave out the return types of methods that return nothing.
+
 
 _CLOSE_S = 2.0
 """How long a closing session keeps sending what waits."""

@@ -12,7 +12,7 @@ import msgspec
 from appliance.errors import PayloadError
 from appliance.model import VersionVector, VolumeInfo
 from appliance.plane.keys import check_name
-from appliance.plane.versions import Record
+from appliance.plane.records import Record
 from appliance.pool import lineage
 from appliance.pool.lineage import VolumeRecord, generation
 

@@ -14,8 +14,8 @@ from msgspec import Struct
 from appliance.errors import RefusedError
 from appliance.model import VersionVector
 from appliance.plane.keys import check_name
+from appliance.plane.records import increment
 from appliance.plane.store import Store
-from appliance.plane.versions import increment
 from appliance.pool import lineage
 from appliance.pool.transfer.archive import fingerprint
 

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from appliance.errors import PayloadError
 from appliance.model import VersionVector
-from appliance.plane.versions import descends
+from appliance.plane.records import descends
 
 KEY = "volume/"
 """Prefix of the records."""

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from appliance.errors import ConflictError, SwiftbotError
 from appliance.model import Failure, TaskRecord, VersionVector, encode
 from appliance.plane.node import Plane
-from appliance.plane.versions import descends
+from appliance.plane.records import descends
 from appliance.tasks import machine
 from appliance.tasks.context import task_key
 from appliance.tasks.machine import Transition, TransitionKind

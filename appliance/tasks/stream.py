@@ -28,8 +28,8 @@ from msgspec.structs import replace
 
 from appliance.errors import SwiftbotError
 from appliance.model import LogLine, Notice, RunEvent, TaskRecord
+from appliance.plane.dedup import Deduplicator
 from appliance.plane.keys import Keys
-from appliance.plane.once import Once
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
 from appliance.tasks import lines
@@ -313,7 +313,7 @@ class Stream:
             if told is not None and told.task == self._task:
                 self._put(told)
 
-        once = Once()
+        once = Deduplicator()
 
         def on_notice(_: str, notice: Notice | None) -> None:
             if notice is not None and notice.task == self._task and once.new(notice.id):

@@ -26,7 +26,7 @@ from appliance.model import (
     SoftStop,
     TaskRecord,
 )
-from appliance.plane.once import Once
+from appliance.plane.dedup import Deduplicator
 from appliance.record.models import RecorderStatus
 from appliance.robots.authority.soft_stop import Stops
 from appliance.tui.safe import safe
@@ -252,7 +252,7 @@ class Store:
         self._connections = 0
         self._stops_heard = 0
         self._heard: dict[str, float] = {}
-        self._noticed = Once()
+        self._noticed = Deduplicator()
         self._newest: tuple[int, tuple[str, ...]] = (-1, ())
 
     # --- what has changed --------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from appliance.plane.router import run_router
+from appliance.plane.node import run_router
 from appliance.plane.settings import PlaneConfig
 
 

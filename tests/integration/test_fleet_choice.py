@@ -35,8 +35,8 @@ from appliance.model import (
     TaskState,
     Way,
 )
-from appliance.plane.facts import Facts, FactsAsk
-from appliance.plane.messages import Found, KeyAsk
+from appliance.plane.membership import Facts, FactsAsk
+from appliance.plane.records import Found, KeyAsk
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.api import TaskAsk
 from appliance.tasks.checkpoints import checkpoint_key

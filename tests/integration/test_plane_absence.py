@@ -9,12 +9,11 @@ import msgspec
 import pytest
 
 from appliance.errors import ConflictError, DeadlineError, PrerequisiteError, UnreachableError
-from appliance.plane import dht, reconcile, settling
-from appliance.plane.messages import Found, KeyAsk, RecordAsk
+from appliance.plane import anti_entropy, dht
 from appliance.plane.node import Plane
+from appliance.plane.records import Found, KeyAsk, Record, RecordAsk
 from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.versions import Record
 
 pytestmark = pytest.mark.anyio
 
@@ -157,7 +156,7 @@ async def test_an_owner_that_has_not_compared_its_copies_says_so(
     planes: list[Plane], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It waits for the comparison; when that takes too long it gives what it has, but does not say there is nothing."""
-    monkeypatch.setattr(settling, "SETTLE_S", 0.05)
+    monkeypatch.setattr(dht, "SETTLE_S", 0.05)
     owner = planes[1]
     missing, there = key_of(owner, "g1", "g2", "g3"), key_of(owner, "g1", "g3", "g2")
     await planes[0].dht.write(there, b"v", expected=None)
@@ -203,7 +202,7 @@ async def test_a_silent_member_holds_up_no_takeover_and_may_have_what_is_missing
     losses = [members for members, within_s in asked if within_s is not None]
     assert len(losses) == 1
     assert "g1" in losses[0]
-    assert {within_s for _, within_s in asked if within_s is not None} == {reconcile.LOSS_S}
+    assert {within_s for _, within_s in asked if within_s is not None} == {anti_entropy.LOSS_S}
     await until(lambda: successor.dht.absence.silent == {"g1"})  # others may be late on a loaded machine
     assert (await successor.dht.read(key) or newer).value == b"before"
     with pytest.raises(UnreachableError, match="g1 may have it"):
@@ -272,12 +271,12 @@ async def test_a_silent_member_that_has_come_back_holds_up_no_write(
     await back.dht.keep(meanwhile)
     membership._seen(token, alive=True)
     assert owner.dht.settling.returned == {"g1"}
-    monkeypatch.setattr(settling, "SETTLE_S", 3600.0)  # nothing but the shorter wait lets a write through
+    monkeypatch.setattr(dht, "SETTLE_S", 3600.0)  # nothing but the shorter wait lets a write through
     await owner.dht.write(same, b"after", expected=versions[same])
     with pytest.raises(ConflictError):
         await owner.dht.write(newer, b"after", expected=versions[newer])
     assert await owner.store.record(newer) == await back.store.record(newer)
-    monkeypatch.setattr(settling, "SETTLE_S", 0.05)
+    monkeypatch.setattr(dht, "SETTLE_S", 0.05)
     with pytest.raises(UnreachableError, match="not compared"):
         await owner.dht.read(missing)
     assert (await owner.dht.read(same) or meanwhile).value == b"after"

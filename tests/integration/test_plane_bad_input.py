@@ -12,11 +12,10 @@ import zenoh
 
 from appliance.errors import ConflictError, PayloadError
 from appliance.model import GatewayStatus, encode
-from appliance.plane.messages import Found, KeyAsk, StoreAsk
 from appliance.plane.node import Plane
+from appliance.plane.records import Found, KeyAsk, Record, StoreAsk, descends
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.versions import Record, descends
 
 pytestmark = pytest.mark.anyio
 

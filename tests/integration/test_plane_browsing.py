@@ -11,10 +11,9 @@ import pytest
 
 from appliance.connection import Endpoint
 from appliance.errors import ConfigError, ConflictError, NotFoundError, PayloadError
-from appliance.plane.messages import Found, StoreAsk
 from appliance.plane.node import Plane
+from appliance.plane.records import Found, Record, StoreAsk
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.versions import Record
 from appliance.records import Records
 
 pytestmark = pytest.mark.anyio

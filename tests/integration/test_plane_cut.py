@@ -10,10 +10,9 @@ from relays import Relay, router
 
 from appliance.errors import ConflictError, SwiftbotError, UnreachableError
 from appliance.model import VersionVector
-from appliance.plane.messages import Found, KeyAsk
 from appliance.plane.node import Plane
+from appliance.plane.records import Found, KeyAsk, Record, descends
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.versions import Record, descends
 
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(120)]
 

@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 
 from appliance.errors import ConfigError
 from appliance.plane import link
-from appliance.plane.dialling import rank
+from appliance.plane.link import rank
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
 

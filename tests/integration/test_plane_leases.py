@@ -9,10 +9,9 @@ import msgspec
 import pytest
 
 from appliance.errors import ConfigError, ConflictError, PayloadError, RefusedError, UnreachableError
+from appliance.plane import leases
+from appliance.plane.leases import Granted, Lease, LeaseAsk
 from appliance.plane.node import STORE_FILE, Plane
-from appliance.plane.quorum import grants
-from appliance.plane.quorum.grants import Granted, LeaseAsk
-from appliance.plane.quorum.leases import Lease
 from appliance.plane.settings import PlaneConfig
 
 pytestmark = pytest.mark.anyio
@@ -147,7 +146,7 @@ async def test_a_minority_grants_nothing(fleet: Fleet) -> None:
 async def test_restarted_grantors_grant_nothing_that_may_be_held(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """All are restarted while a lease lasts: none before the longest lease is over, then one of a higher fence."""
     lease = await fleet.planes[0].leases.acquire(KEY, ttl_s=30)
-    monkeypatch.setattr(grants, "LONGEST_S", 3.0)
+    monkeypatch.setattr(leases, "LONGEST_S", 3.0)
     await fleet.stop(0, 1, 2)
     for number in range(3):
         await fleet.start(number)

@@ -10,11 +10,10 @@ import pytest
 from plane_fleet import Fleet, fleet_of, until
 
 from appliance.errors import ConfigError, ConflictError, RefusedError
-from appliance.plane.messages import Found, StoreAsk
 from appliance.plane.node import STORE_FILE, Plane
+from appliance.plane.records import Found, Record, StoreAsk, Write, descends
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.plane.versions import Record, Write, descends
 
 pytestmark = pytest.mark.anyio
 

@@ -11,9 +11,9 @@ from plane_fleet import Fleet, fleet_of
 
 from appliance.errors import ConflictError, PayloadError, SwiftbotError, UnreachableError
 from appliance.plane.node import Plane
+from appliance.plane.records import Record, Write, descends
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.versions import Record, Write, descends
 
 pytestmark = pytest.mark.anyio
 

@@ -12,8 +12,7 @@ import pytest
 from msgspec import Struct
 
 from appliance.errors import ConfigError, ConflictError, UnreachableError
-from appliance.plane.node import Plane
-from appliance.plane.router import run_router
+from appliance.plane.node import Plane, run_router
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 

@@ -19,7 +19,7 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.model import ErrorReply, LogLine, encode
-from appliance.plane import asking
+from appliance.plane import session
 from appliance.plane.session import Message, Session
 from appliance.plane.settings import PlaneConfig
 
@@ -160,12 +160,12 @@ async def test_a_question_that_may_have_been_heard_is_told_from_one_that_went_no
     assert not nobody.value.sent
     other.serve("swiftbot/f/q", never)
     await heard(one, other)
-    asking = asyncio.create_task(one.query("swiftbot/f/q", b"x", timeout_s=60, direct=direct))
+    session = asyncio.create_task(one.query("swiftbot/f/q", b"x", timeout_s=60, direct=direct))
     await asked.wait()
     # As the death of its process does: nobody is told anything.
     await asyncio.to_thread(other._wire.raw.close)
     with pytest.raises(UnreachableError) as gone:
-        await asking
+        await session
     assert gone.value.sent
 
 
@@ -273,7 +273,7 @@ async def test_answers_to_everybody_are_bounded(free_port: int, monkeypatch: pyt
     endpoint = f"tcp/127.0.0.1:{free_port}"
     one = await Session.open(PlaneConfig(listen=(endpoint,), queue_bytes=2**20), "f")
     other = await Session.open(PlaneConfig(connect=(endpoint,)), "f")
-    monkeypatch.setattr(asking, "MOST_ANSWERS", 20)
+    monkeypatch.setattr(session, "MOST_ANSWERS", 20)
 
     def many(query: zenoh.Query) -> None:
         payload = query.payload.to_bytes() if query.payload is not None else b""

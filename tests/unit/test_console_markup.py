@@ -31,8 +31,8 @@ from appliance.model import (
     SoftStop,
     TaskRecord,
 )
-from appliance.plane.browsing import RecordPlace
-from appliance.plane.versions import Record
+from appliance.plane.dht import RecordPlace
+from appliance.plane.records import Record
 from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
 from appliance.records import Held

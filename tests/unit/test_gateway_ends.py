@@ -10,7 +10,7 @@ import pytest
 from appliance import gateway as daemon
 from appliance import service
 from appliance.errors import ConfigError, Exit
-from appliance.plane.namesake import displaced
+from appliance.plane.membership import displaced
 
 pytestmark = pytest.mark.anyio
 

@@ -9,6 +9,6 @@ Sources: Gray, Cheriton, "Leases: an efficient fault-tolerant mechanism for dist
 Lamport, "Paxos made simple", 2001 (majorities, and numbers that only increase).
 """
 
-from appliance.plane.quorum.leases import Lease, Leases
+from appliance.plane.leases import Lease, Leases
 
 __all__ = ["Lease", "Leases"]

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.plane.absence import GONE_S, Absence
+from appliance.plane.dht import GONE_S, Absence
 from appliance.plane.ring import Ring
 
 NAMES = tuple(f"g{number}" for number in range(8))

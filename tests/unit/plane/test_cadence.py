@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.plane.cadence import MEMORY_S, Cadence, Rate, bounds, heartbeat_s, interval_s
+from appliance.plane.registry import RATE_MEMORY_S, Cadence, Rate, bounds, heartbeat_s, interval_s
 
 rates = st.floats(0, 1000)
 listeners = st.integers(0, 1000)
@@ -33,10 +33,10 @@ def test_more_volatile_or_more_asked_for_is_sooner_and_more_listeners_later(
 
 def test_the_interval_costs_least() -> None:
     """Between the bounds, no other interval makes stale decisions and messages together cheaper."""
-    from appliance.plane.cadence import PRICE  # noqa: PLC0415 - only here
+    from appliance.plane.registry import DELIVERY_PRICE  # noqa: PLC0415 - only here
 
     def cost(interval_s: float) -> float:
-        return PRICE * 3 / interval_s + 4.0 * 1.5 * interval_s / 2
+        return DELIVERY_PRICE * 3 / interval_s + 4.0 * 1.5 * interval_s / 2
 
     best = interval(4.0, 1.5, 3)
     assert LEAST < best < MOST
@@ -89,12 +89,12 @@ def test_a_quiet_thing_is_told_at_once() -> None:
 def test_a_rate_is_learned_and_forgotten(rate: float, seconds: int) -> None:
     """Steady events are counted at about their rate, and after a few memories of silence as none."""
     it = Rate()
-    for number in range(int(rate * (seconds + 3 * MEMORY_S))):
+    for number in range(int(rate * (seconds + 3 * RATE_MEMORY_S))):
         it.add(number / rate)
-    end = int(rate * (seconds + 3 * MEMORY_S)) / rate
-    assert it.read(end) <= rate + 1 / MEMORY_S
-    assert it.read(end) >= rate * 0.8 - 1 / MEMORY_S
-    assert it.read(end + 10 * MEMORY_S) < 0.01 * rate
+    end = int(rate * (seconds + 3 * RATE_MEMORY_S)) / rate
+    assert it.read(end) <= rate + 1 / RATE_MEMORY_S
+    assert it.read(end) >= rate * 0.8 - 1 / RATE_MEMORY_S
+    assert it.read(end + 10 * RATE_MEMORY_S) < 0.01 * rate
 
 
 @settings(deadline=None)

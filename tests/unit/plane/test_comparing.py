@@ -6,13 +6,13 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.plane.comparing import Compared, Comparing, DigestAsk, DigestList, FetchAsk, FetchList
+from appliance.plane.anti_entropy import Compared, Comparing, DigestAsk, DigestList, FetchAsk, FetchList
 from appliance.plane.membership import Membership
+from appliance.plane.records import Record
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.plane.versions import Record
 
 pytestmark = pytest.mark.anyio
 RING = Ring({"gw-1", "gw-2"}, virtual_nodes=4)

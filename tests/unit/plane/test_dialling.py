@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.plane.dialling import dialled, rank, session_id
+from appliance.plane.link import dialled, rank, session_id
 
 names = st.from_regex(r"[a-z][a-z0-9-]{0,15}", fullmatch=True)
 

@@ -3,8 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.plane.doors import WITNESS_S, Mixups
-from appliance.plane.sockets import CALM_S
+from appliance.plane.link import CALM_S
+from appliance.plane.session import WITNESS_S, Mixups
 
 times = st.lists(st.floats(0, 1000, allow_nan=False), max_size=60).map(sorted)
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import GatewayStatus
-from appliance.plane.namesake import HEARD, HEARD_S, Suspicion, goes, process
+from appliance.plane.membership import NAMESAKE_S, NAMESAKE_STATUSES, Suspicion, goes, process
 
 processes = st.tuples(st.integers(1, 3), st.integers(1, 3))
 
@@ -23,7 +23,7 @@ def test_each_hears_of_the_others_and_all_but_one_go(them: list[tuple[int, int]]
         for speaker in them:
             for each, suspicion in sides.items():
                 suspects[each] |= suspicion.heard(status(speaker), status(each), float(number))
-    enough = len(them) > 1 and times >= HEARD and times - 1 >= HEARD_S
+    enough = len(them) > 1 and times >= NAMESAKE_STATUSES and times - 1 >= NAMESAKE_S
     assert all(found is enough for found in suspects.values())
     stays = [each for each in them if not goes(each, [process(status(other)) for other in them if other != each])]
     assert stays == [min(them)]

@@ -1,6 +1,6 @@
 """Writes that are asked for again: what their owner remembers of them."""
 
-from appliance.plane.ordering import Acknowledged
+from appliance.plane.dht import Acknowledged
 
 
 def test_a_write_is_known_by_its_key_and_id() -> None:

@@ -6,14 +6,18 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.plane.comparing import ASK_S, SEE_S
+from appliance.plane.anti_entropy import COMPARE_S, LOSS_S, SEE_S
+from appliance.plane.dht import RETURNED_S
 from appliance.plane.keys import Keys
-from appliance.plane.membership import Membership
-from appliance.plane.outlived import MOST_ASKED, REST_S, TRIES, Outlived
-from appliance.plane.pulse import Pulse, Standstill
-from appliance.plane.reconcile import LOSS_S
+from appliance.plane.membership import (
+    MOST_ASKED,
+    RELINK_REST_S,
+    RELINK_TRIES,
+    Membership,
+    Outlived,
+    Stall,
+)
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.settling import RETURNED_S
 
 pytestmark = pytest.mark.anyio
 LEASE_S = 1.0
@@ -23,7 +27,7 @@ class Bench:
     """A pulse and a membership in the test's hands; `after` happens in each pause."""
 
     def __init__(self, *tokens: tuple[str, float]) -> None:
-        self.on_stalled: list[Callable[[Standstill], None]] = []
+        self.on_stalled: list[Callable[[Stall], None]] = []
         self.tokens = dict(tokens)
         self.answering: set[str] = set()
         self.gone: dict[str, float] = {}
@@ -91,7 +95,7 @@ class Bench:
         """Stand still, and wait until all is looked at."""
         self.now = since + lasted_s
         for tell in tuple(self.on_stalled):
-            tell(Standstill(since, lasted_s))
+            tell(Stall(since, lasted_s))
         others = asyncio.all_tasks() - {cast("Any", asyncio.current_task())}
         await asyncio.gather(*(each for each in others if each.get_name() == "links after a standstill"))
 
@@ -127,7 +131,7 @@ async def test_in_a_fleet_of_two_silence_is_enough() -> None:
     await bench.stand_still(10.0, 1.1)
     assert len(bench.renewed) == 1
     bench.answering = {"gw-2"}
-    await bench.stand_still(10.0 + 2 * REST_S, 1.1)
+    await bench.stand_still(10.0 + 2 * RELINK_REST_S, 1.1)
     assert (bench.asked, len(bench.renewed)) == (["gw-2"] * 3, 1)
 
 
@@ -173,11 +177,11 @@ async def test_a_look_that_is_under_way_is_not_begun_again() -> None:
     )  # fmt: skip
     tell = bench.on_stalled[-1]
     bench.now = 20.0
-    tell(Standstill(10.0, 1.1))
+    tell(Stall(10.0, 1.1))
     await asked.wait()
     asked.clear()
-    bench.now = 20.0 + 2 * REST_S
-    tell(Standstill(bench.now, 1.1))
+    bench.now = 20.0 + 2 * RELINK_REST_S
+    tell(Stall(bench.now, 1.1))
     goes_on.set()
     await asyncio.gather(*(each for each in asyncio.all_tasks() if each.get_name() == "links after a standstill"))
     assert (len(bench.asked), len(bench.renewed)) == (2, 1)
@@ -213,7 +217,7 @@ async def test_it_is_not_done_again_at_once() -> None:
     bench.answering.clear()
     bench.tokens = {"gw-2": 13.2, "gw-3": 5.0}
     await bench.stand_still(12.0, 1.1)
-    assert bench.pauses[0] == pytest.approx(REST_S - 2.0)
+    assert bench.pauses[0] == pytest.approx(RELINK_REST_S - 2.0)
     assert len(bench.renewed) == 2
 
 
@@ -238,8 +242,8 @@ async def test_links_that_are_mixed_up_again_are_made_anew_again() -> None:
     bench = Bench(("gw-2", 11.05), ("gw-3", 5.0))
     bench.answering, bench.heals = {"gw-2"}, False
     await bench.stand_still(10.0, 1.1)
-    assert bench.asked == ["gw-3", *["gw-2", "gw-3"] * (TRIES - 1)]
-    assert len(bench.renewed) == TRIES
+    assert bench.asked == ["gw-3", *["gw-2", "gw-3"] * (RELINK_TRIES - 1)]
+    assert len(bench.renewed) == RELINK_TRIES
 
 
 async def test_nothing_is_done_when_all_were_lost_or_nobody_can_have_noticed() -> None:
@@ -274,7 +278,7 @@ def test_membership_knows_since_when_a_token_was_seen(monkeypatch: pytest.Monkey
 
 def test_whoever_is_not_seen_hears_so_before_its_question_ends() -> None:
     """Otherwise a token that was forgotten is never shown again."""
-    assert SEE_S < ASK_S
+    assert SEE_S < COMPARE_S
 
 
 def test_a_silent_member_leaves_a_takeover_its_second() -> None:

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.plane.partners import partners, sharing
+from appliance.plane.anti_entropy import partners, sharing
 from appliance.plane.ring import Ring
 
 fleets = st.sets(st.integers(0, 30).map(lambda number: f"g{number}"), max_size=12)

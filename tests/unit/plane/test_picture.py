@@ -3,8 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.plane.picture import Picture
-from appliance.plane.versions import Record
+from appliance.plane.records import Record
+from appliance.plane.store import Picture
 
 _KEYS = st.sampled_from(["a", "b", "c", "d"])
 _STEPS = st.lists(

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from appliance.plane.pulse import Pulse, Standstill
+from appliance.plane.membership import Stall, StallDetector
 
 pytestmark = pytest.mark.anyio
 
@@ -23,7 +23,7 @@ class Clock:
 async def test_standing_still_is_noticed_by_whoever_looks_first() -> None:
     """Three quarters of a lease without a beat put a gateway in doubt for a lease, and its listeners hear of it."""
     clock, told = Clock(), asyncio.Event()
-    pulse = Pulse(1.0, clock=clock)
+    pulse = StallDetector(1.0, clock=clock)
     pulse.on_stalled.append(lambda _: told.set())
     pulse.start()
     try:
@@ -47,14 +47,14 @@ async def test_standing_still_is_noticed_by_whoever_looks_first() -> None:
 async def test_each_standstill_is_told_as_what_it_was() -> None:
     """A second, shorter one before the event loop gets its turn does not hide the first."""
     clock, both = Clock(), asyncio.Event()
-    told: list[Standstill] = []
+    told: list[Stall] = []
 
-    def take(standstill: Standstill) -> None:
+    def take(standstill: Stall) -> None:
         told.append(standstill)
         if len(told) == 2:
             both.set()
 
-    pulse = Pulse(1.0, clock=clock)
+    pulse = StallDetector(1.0, clock=clock)
     pulse.on_stalled.append(take)
     pulse.start()
     try:
@@ -70,7 +70,7 @@ async def test_each_standstill_is_told_as_what_it_was() -> None:
 async def test_time_before_the_start_and_after_the_end_counts_for_nothing() -> None:
     """A gateway that is still opening or already closed did not stand still."""
     clock = Clock()
-    pulse = Pulse(1.0, clock=clock)
+    pulse = StallDetector(1.0, clock=clock)
     clock.now += 60
     assert not pulse.doubtful
     pulse.start()
@@ -88,7 +88,7 @@ async def test_the_pulse_beats_while_the_loop_is_held_up() -> None:
         beats.append(0.0)
         return 0.0
 
-    pulse = Pulse(0.01, clock=clock)
+    pulse = StallDetector(0.01, clock=clock)
     pulse.start()
     try:
         while len(beats) < 10:  # the loop gets no turn

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from appliance.plane.queues import Inbox, Outbox
+from appliance.plane.session import Inbox, Outbox
 
 pytestmark = pytest.mark.anyio
 

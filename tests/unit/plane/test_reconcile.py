@@ -7,17 +7,13 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.plane import reconcile
-from appliance.plane.absence import Absence
-from appliance.plane.comparing import DigestAsk
-from appliance.plane.dht import Dht
+from appliance.plane import anti_entropy
+from appliance.plane.anti_entropy import DigestAsk, Reconciler, Step, StepKind
+from appliance.plane.dht import Absence, Dht
 from appliance.plane.membership import Membership
-from appliance.plane.pulse import Pulse
-from appliance.plane.reconcile import Reconciler
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
-from appliance.plane.steps import Kind, Step
 from appliance.plane.store import Store
 
 pytestmark = pytest.mark.anyio
@@ -85,13 +81,13 @@ async def test_those_that_were_lost_are_asked_whether_they_are_there() -> None:
     for name in ("gw-2", "gw-3"):
         for lost in bench.membership.on_lost:
             lost(name)
-    await bench.reconciler._round(Step(kind=Kind.REST, ring=RING, stalls=0), tidy=False)
+    await bench.reconciler._round(Step(kind=StepKind.REST, ring=RING, stalls=0), tidy=False)
     assert sorted(bench.asked) == ["gw-2", "gw-3"]
 
 
 async def test_what_goes_wrong_with_settling_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A defect met when a comparison is done is counted, and the comparison is done again until it is settled."""
-    monkeypatch.setattr(reconcile, "_AGAIN_S", 0.0)
+    monkeypatch.setattr(anti_entropy, "_AGAIN_S", 0.0)
     bench = Bench()
     bench.failures = 3
     bench.reconciler.start()

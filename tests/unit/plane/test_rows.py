@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.plane import rows
-from appliance.plane.file import TABLES
-from appliance.plane.rows import put_row, read_digests, read_kept, read_keys, read_records
-from appliance.plane.versions import Record, digest
+from appliance.plane import store
+from appliance.plane.records import Record, digest
+from appliance.plane.store import TABLES, put_row, read_digests, read_kept, read_keys, read_records
 
 _KEYS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\U0010ffff"), min_size=1, max_size=6)
 _RECORDS = st.dictionaries(
@@ -32,7 +31,7 @@ _RECORDS = st.dictionaries(
 @pytest.fixture(autouse=True)
 def small_pages() -> Iterator[None]:
     """Several pages of a few rows."""
-    with patch.object(rows, "_MOST_NAMES", 3), patch.object(rows, "_MOST_VALUES", 2):
+    with patch.object(store, "_MOST_NAMES", 3), patch.object(store, "_MOST_VALUES", 2):
         yield
 
 
@@ -72,7 +71,7 @@ def test_large_values_come_in_smaller_pages() -> None:
     for record in records:
         put_row(db, record)
     db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2500)
-    with patch.object(rows, "_MOST_VALUES", 8):
+    with patch.object(store, "_MOST_VALUES", 8):
         assert read_records(db, "k") == records
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 1500)
         with pytest.raises(sqlite3.DataError):

@@ -6,11 +6,10 @@ from typing import cast
 
 import pytest
 
-from appliance.plane import settling
+from appliance.plane import dht
+from appliance.plane.dht import Settling
 from appliance.plane.membership import Membership
-from appliance.plane.pulse import Pulse
 from appliance.plane.ring import Ring
-from appliance.plane.settling import Settling
 
 pytestmark = pytest.mark.anyio
 
@@ -62,7 +61,7 @@ async def test_whoever_came_back_is_waited_for_a_shorter_time(monkeypatch: pytes
     here, _, _ = _settling()
     await here.settled(RING, 0)
     here.returned = frozenset({"b"})
-    monkeypatch.setattr(settling, "SETTLE_S", 3600.0)
+    monkeypatch.setattr(dht, "SETTLE_S", 3600.0)
     assert not await here.until_mine(MINE, returned_s=0.01)
     waiting = asyncio.create_task(here.until_mine(MINE))
     await asyncio.sleep(0.02)
@@ -70,7 +69,7 @@ async def test_whoever_came_back_is_waited_for_a_shorter_time(monkeypatch: pytes
     here.returned = frozenset()
     await here.settled(RING, 0)
     assert await waiting
-    monkeypatch.setattr(settling, "SETTLE_S", 0.01)
+    monkeypatch.setattr(dht, "SETTLE_S", 0.01)
     here.returned = frozenset({"b"})
     assert not await here.until_mine(MINE)
 
@@ -82,10 +81,10 @@ async def test_those_never_compared_with_are_waited_for_a_moment(monkeypatch: py
     assert here.met()
     membership.ring = RING.with_member("c")
     assert not here.met()
-    monkeypatch.setattr(settling, "RETURNED_S", 0.01)
+    monkeypatch.setattr(dht, "RETURNED_S", 0.01)
     await here.until_met()
     assert not here.met()
-    monkeypatch.setattr(settling, "RETURNED_S", 3600.0)
+    monkeypatch.setattr(dht, "RETURNED_S", 3600.0)
     waiting = asyncio.create_task(here.until_met())
     await asyncio.sleep(0)
     await here.settled(membership.ring, 0)
@@ -95,7 +94,7 @@ async def test_those_never_compared_with_are_waited_for_a_moment(monkeypatch: py
 
 async def test_a_request_for_a_key_that_is_given_away_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Members of a partition come back one by one: a key owned for a moment is another's once the last has come."""
-    monkeypatch.setattr(settling, "SETTLE_S", 3600.0)
+    monkeypatch.setattr(dht, "SETTLE_S", 3600.0)
     here, membership, _ = _settling()
     membership.ring = Ring(("a",), virtual_nodes=8)
     waiting = asyncio.create_task(here.until_mine(OTHERS))

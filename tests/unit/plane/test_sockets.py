@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.plane.sockets import SocketWatch, address_of
+from appliance.plane.link import SocketWatch, address_of
 
 
 def limit(handle: socket.socket) -> int:

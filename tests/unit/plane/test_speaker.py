@@ -7,7 +7,7 @@ import pytest
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus
 from appliance.plane.keys import Keys
-from appliance.plane.speaker import LOAD_STEP, Speaker, tells_more, told_demand
+from appliance.plane.registry import LOAD_STEP, Speaker, tells_more, told_demand
 
 pytestmark = pytest.mark.anyio
 

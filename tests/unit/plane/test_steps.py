@@ -3,8 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.plane.anti_entropy import Settled, StepKind, Steps
 from appliance.plane.ring import Ring
-from appliance.plane.steps import Kind, Settled, Steps
 
 REPLICAS = 3
 names = st.sampled_from([f"g{number}" for number in range(9)])
@@ -24,7 +24,7 @@ def test_whoever_held_what_is_gained_by_a_loss_is_asked_before_anybody_who_has_c
     old, new = ring(before), ring(now)
     step = Steps("me", replicas=REPLICAS).next(Settled(old, 0), new, 0)
     if before - now:
-        assert step.kind is Kind.LOSS
+        assert step.kind is StepKind.LOSS
         assert step.ring.members == before & now
         assert set(step.asked) <= before & now
         for number in range(60):
@@ -33,7 +33,7 @@ def test_whoever_held_what_is_gained_by_a_loss_is_asked_before_anybody_who_has_c
                 assert step.ring.owner(key) == "me"
                 assert set(old.successors(key, REPLICAS)) & now - {"me"} <= set(step.asked)
     else:
-        assert step.kind is (Kind.REST if before == now else Kind.ARRIVAL)
+        assert step.kind is (StepKind.REST if before == now else StepKind.ARRIVAL)
 
 
 @given(st.lists(st.tuples(fleets, st.integers(0, 2)), min_size=1, max_size=8))
@@ -52,7 +52,7 @@ def test_a_ring_that_stands_still_is_settled_after_two_steps(history: list[tuple
     for _ in range(2):
         settled = steps.settled(steps.next(settled, now, stalls))
     assert settled == Settled(now, stalls)
-    assert steps.next(settled, now, stalls).kind is Kind.REST
+    assert steps.next(settled, now, stalls).kind is StepKind.REST
 
 
 @given(fleets, fleets)
@@ -65,4 +65,4 @@ def test_a_loss_interrupts_what_can_wait_and_nothing_interrupts_a_takeover_but_o
     assert steps.urgent(step, now, 1)
     for lost in step.ring.members - {"me"}:
         urgent = steps.urgent(step, now - {lost}, 0)
-        assert urgent == (step.kind is not Kind.LOSS or lost in step.asked)
+        assert urgent == (step.kind is not StepKind.LOSS or lost in step.asked)

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from appliance.errors import ConfigError, ConflictError, PrerequisiteError, RefusedError
+from appliance.plane.records import Record, Write, decide
 from appliance.plane.store import Store
-from appliance.plane.versions import Record, Write, decide
 
 pytestmark = pytest.mark.anyio
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError
-from appliance.plane.versions import (
+from appliance.plane.records import (
     MAX_KEY,
     Behind,
     Record,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import PayloadError
-from appliance.plane.versions import increment
+from appliance.plane.records import increment
 from appliance.pool.lineage import Relation, VolumeRecord, generation, read, relation, stronger
 
 VERSIONS = st.dictionaries(st.sampled_from(["a", "b", "c"]), st.integers(1, 4), min_size=1)

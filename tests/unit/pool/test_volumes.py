@@ -9,8 +9,8 @@ import pytest
 
 from appliance.errors import ConflictError, NotFoundError, RefusedError, UnreachableError
 from appliance.model import VersionVector, VolumeInfo
+from appliance.plane.records import Record, increment
 from appliance.plane.store import Store
-from appliance.plane.versions import Record, increment
 from appliance.pool.folders import LABEL_KEPT
 from appliance.pool.storage import FoundVolume, PodmanStorage
 from appliance.pool.transfer.archive import pack

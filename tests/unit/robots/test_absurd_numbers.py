@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from appliance.model import Pose, RobotInfo, Site, encode
 from appliance.model.plausible import MAX_VERBS, plausible, read_robot
-from appliance.plane.publishing import Message as Put
-from appliance.plane.roster import Roster
+from appliance.plane.registry import Roster
+from appliance.plane.session import Message as Put
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.vehicle import Vehicle
 from tests.unit.robots.links import BEAT

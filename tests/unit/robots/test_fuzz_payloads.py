@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from appliance.errors import PayloadError
 from appliance.model import RobotInfo, TaskRequest, encode
 from appliance.model.plausible import plausible
-from appliance.plane.publishing import Message as Put
-from appliance.plane.roster import Roster
+from appliance.plane.registry import Roster
+from appliance.plane.session import Message as Put
 from appliance.robots.task_listener import MAX_BYTES, read_request
 from tests.unit.robots.test_executor import Robot
 

@@ -7,8 +7,8 @@ import msgspec
 import pytest
 
 from appliance.model import RobotCommand, RobotInfo, RobotReply, encode
-from appliance.plane import roster as rosters
-from appliance.plane.roster import Roster
+from appliance.plane import registry as rosters
+from appliance.plane.registry import Roster
 from appliance.robots.sender import send_command
 from tests.unit.robots.conftest import FakeSession
 

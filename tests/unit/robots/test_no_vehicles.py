@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from appliance.errors import NotFoundError, RefusedError
 from appliance.model import RobotInfo
-from appliance.plane.roster import Roster
+from appliance.plane.registry import Roster
 from appliance.ports import free_port
 from appliance.robots.api import RobotForget
 from appliance.robots.hub import RobotHub

@@ -12,8 +12,8 @@ from appliance.errors import ConflictError, SwiftbotError, UnreachableError
 from appliance.model import Plan, TaskRecord, VersionVector
 from appliance.plane.dht import LeaveOut, Record
 from appliance.plane.keys import Keys
+from appliance.plane.records import increment
 from appliance.plane.session import Message
-from appliance.plane.versions import increment
 from tests.unit.tasks.sample_records import accepted, plan_of
 
 

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from appliance.errors import RefusedError
 from appliance.model import Failure, Plan, Split, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState, encode
+from appliance.plane.records import Record
 from appliance.plane.store import Store
-from appliance.plane.versions import Record
 from appliance.tasks.api import RetryAsk
 from appliance.tasks.conflicts import merged, stronger
 from appliance.tasks.retention import TRIMMED, Kept, answered, done_text, due, may_trim, trimmed

@@ -15,9 +15,7 @@ from msgspec import Struct
 
 from appliance.model import encode
 from appliance.plane.keys import Keys
-from appliance.plane.overlay.lookup import Lookup, NextAsk
-from appliance.plane.overlay.upkeep import Meet, MeetAsk, Seek, Upkeep
-from appliance.plane.overlay.view import View
+from appliance.plane.overlay import Lookup, Meet, MeetAsk, NextAsk, Seek, Upkeep, View
 from appliance.plane.ring import RING_SIZE, Ring
 
 FRAMING = 64

@@ -16,8 +16,7 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 from appliance.plane.keys import Keys
-from appliance.plane.overlay.lookup import Lookup
-from appliance.plane.overlay.view import View, successor_count
+from appliance.plane.overlay import Lookup, View, successor_count
 from appliance.plane.ring import Ring, position
 from workshop.bench.dht import chord
 from workshop.bench.dht.fleet import FRAMING, Fleet

@@ -18,7 +18,7 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
 from appliance.llm.settings import LlmConfig
-from appliance.plane.messages import Found, KeyAsk, RecordChange, Written
+from appliance.plane.records import Found, KeyAsk, RecordChange, Written
 from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig

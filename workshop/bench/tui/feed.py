@@ -30,7 +30,7 @@ from appliance.model import (
     Tier,
     encode,
 )
-from appliance.plane.facts import Facts, FactsAsk, Known
+from appliance.plane.membership import Facts, FactsAsk, Known
 from appliance.plane.node import Member, MemberAsk
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session

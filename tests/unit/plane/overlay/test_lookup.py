@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.plane.overlay.lookup import MOST_ASKED, Lookup
-from appliance.plane.overlay.view import Around, Step, View, bound_for
+from appliance.plane.overlay import MOST_ASKED, Around, Lookup, Step, View, bound_for
 from appliance.plane.ring import RING_SIZE, Ring, point
 from workshop.bench.dht.fleet import Fleet
 

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.plane.overlay.upkeep import Meet, MeetAsk, Pace, Seek, Upkeep
-from appliance.plane.overlay.view import Around, View, bound_for, successor_count
+from appliance.plane.overlay import Around, Meet, MeetAsk, Pace, Seek, Upkeep, View, bound_for, successor_count
 from appliance.plane.ring import Ring
 from workshop.bench.dht.fleet import Fleet
 

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from appliance.plane.overlay.view import View, bound_for
+from appliance.plane.overlay import View, bound_for
 from appliance.plane.ring import Ring
 
 SIZE = 200

@@ -6,16 +6,7 @@ import random
 import pytest
 
 from appliance.errors import PayloadError, RefusedError
-from appliance.plane.quorum.grants import (
-    LONGEST_S,
-    Granted,
-    Grantor,
-    LeaseAsk,
-    LeaseEnd,
-    granted,
-    highest,
-    holder,
-)
+from appliance.plane.leases import LONGEST_S, Granted, Grantor, LeaseAsk, LeaseEnd, granted, highest, holder
 
 KEY = "reservation/aisle-3"
 GRANTORS = 3
@@ -196,7 +187,7 @@ def test_a_restarted_grantor_is_silent_for_the_longest_lease() -> None:
 
 def test_absurd_fences_and_too_many_grants_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither uses up the numbers or the memory; what has ended makes room."""
-    monkeypatch.setattr("appliance.plane.quorum.grants.MOST_GRANTS", 2)
+    monkeypatch.setattr("appliance.plane.leases.MOST_GRANTS", 2)
     grantor = Grantor(fence=0, now=0.0)
     with pytest.raises(PayloadError):
         grantor.grant(ask("a", 2**50), 0.0)

@@ -1,14 +1,14 @@
-"""What is told more than once under one id, and is to be heard once: such as by both sides of a partition."""
+"""Deduplication: what is told more than once under one id, such as by both sides of a partition, is heard once."""
 
 from collections import OrderedDict
 
-_MOST = 4096
+_MOST_IDS = 4096
 
 
-class Once:
+class Deduplicator:
     """Remembers the ids that came last, at most `most`."""
 
-    def __init__(self, most: int = _MOST) -> None:
+    def __init__(self, most: int = _MOST_IDS) -> None:
         self._most = most
         self._seen: OrderedDict[str, None] = OrderedDict()
 
