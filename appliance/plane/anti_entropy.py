@@ -231,7 +231,7 @@ _FETCH_BYTES = 2 * 2**20
 """Values in one answer, unless a single one is larger."""
 SEE_S = 0.7
 """How long a member waits to see the token of the one that asks: shorter than a question lasts, or whoever is not seen
-would never hear so, and show its token again. (After a loss nobody is waited for so long, `reconcile`; whoever was
+would never hear so, and show its token again. (After a loss nobody is waited for so long, `LOSS_S`; whoever was
 silent is asked once more right after it.)"""
 
 

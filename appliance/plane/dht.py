@@ -69,11 +69,11 @@ SETTLE_S = 2.0
 """How long an owner lets requests wait for its reconciling; then it answers with what it has."""
 RETURNED_S = 0.4
 """How long of it a write waits for one that has come back and is not compared with yet: if it holds something newer, it
-says so when it is given the write. One that is silent must hold up no takeover for long, `reconcile.LOSS_S`."""
+says so when it is given the write. One that is silent must hold up no takeover for long, `anti_entropy.LOSS_S`."""
 
 
 class Settling:
-    """What `reconcile` has compared, and the requests that wait for it. `replicas`: copies of a record."""
+    """What `anti_entropy` has compared, and the requests that wait for it. `replicas`: copies of a record."""
 
     def __init__(
         self, *, gateway: str, membership: Membership, pulse: StallDetector, replicas: int, virtual_nodes: int
@@ -166,7 +166,7 @@ class Settling:
 
 GONE_S = 600.0
 """For so long members that were lost may come back with what only they have: as long as they are asked whether they are
-there after all (`reconcile`)."""
+there after all (`anti_entropy`)."""
 _MOST_RINGS = 8
 
 

@@ -24,6 +24,7 @@ the two meet again before, one side goes on with what it knew and the other begi
 TCP_USER_TIMEOUT (tcp(7)), which `SocketWatch` sets from outside, the kernel gives up after the lease, when Zenoh takes
 the other side for dead as well.
 """
+# pyright: reportUnknownMemberType=false
 
 import asyncio
 import contextlib
@@ -211,7 +212,6 @@ def _address(name: Any) -> Address:
     return str(mapped or host), int(name[1])
 
 
-# pyright: reportUnknownMemberType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 

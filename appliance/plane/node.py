@@ -26,9 +26,9 @@ from appliance.errors import ConfigError, DeadlineError, SwiftbotError, Unreacha
 from appliance.plane.anti_entropy import Reconciler
 from appliance.plane.dht import Browsing, Dht
 from appliance.plane.keys import Keys, check_name
+from appliance.plane.leases import Leases
 from appliance.plane.link import dialled
 from appliance.plane.membership import Membership, Outlived, StallDetector, displaced
-from appliance.plane.quorum import Leases
 from appliance.plane.registry import Registry
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc

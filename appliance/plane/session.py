@@ -36,6 +36,7 @@ three of four fleets with one queryable each never came to rest: some members we
 (docs/benchmarks.md). Why is not known; of ten with a queryable for each verb all did. The recorder and other clients of
 Zenoh see no difference: the keys are the same.
 """
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 
 import asyncio
 import contextlib
@@ -191,7 +192,6 @@ class Outbox:
             self._waiting.clear()
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 
@@ -270,9 +270,6 @@ class Wire:
         if self._bulk is not None:
             await asyncio.to_thread(self._bulk.close, timeout_s)
         await asyncio.to_thread(self.raw.close)
-
-
-# pyright: reportUnknownMemberType=false
 
 
 WITNESS_S = 60.0
@@ -367,9 +364,6 @@ class Doors:
             log.warning("links are made anew", why=why, links=broken, other=other or "all")
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
-
-
 T = TypeVar("T")
 
 FLOOD_QUEUED = 16_384
@@ -454,7 +448,6 @@ class Flood(Generic[T]):
         batch.append(self._make(key, at_ns, payload.to_bytes(), str(sample.encoding), deleted, source, number))
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 
@@ -606,7 +599,6 @@ class Publishing:
         return self.subscribe(expr, take, heed=heed)
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 
@@ -670,7 +662,6 @@ class Presence:
         return closer
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 
@@ -808,7 +799,6 @@ class Served:
             link.reply(query, self.expr, None, RefusedError("too busy", remedy="try again in a moment"))
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 
@@ -855,7 +845,6 @@ async def _nobody(key: str, payload: bytes) -> bytes:
     raise UnreachableError(f"nobody answers on {key}", remedy=link.NOBODY_REMEDY)
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 
@@ -1126,7 +1115,6 @@ class _Bounds:
             return True
 
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
 # The library's stubs leave out the return types of methods that return nothing.
 
 

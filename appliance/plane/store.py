@@ -167,7 +167,7 @@ def problem_of(error: sqlite3.Error, path: Path) -> SwiftbotError:
     return PrerequisiteError(f"{path} cannot be used: {text}", remedy="check the disk")
 
 
-Row = TypeVar("T", bound=tuple[Any, ...])
+Row = TypeVar("Row", bound=tuple[Any, ...])
 
 _COLUMNS = "key, value, version, deleted, write"
 _LAST = "\U0010ffff"

@@ -172,7 +172,7 @@ async def test_who_waits_hears_that_a_gateway_stops(fleet: Fleet, monkeypatch: p
     with monkeypatch.context() as patched:
         for number in (0, 2):
             _stores(fleet.planes[number], never, patched)
-        patched.setattr("appliance.plane.dht._AGAIN_S", ())
+        patched.setattr("appliance.plane.dht._PUSH_AGAIN_S", ())
         own = asyncio.create_task(owner.dht.write(key, b"1", expected=None))
         others = asyncio.create_task(fleet.planes[0].dht.write(another, b"2", expected=None))
         await both.wait()

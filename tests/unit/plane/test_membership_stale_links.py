@@ -16,6 +16,7 @@ from appliance.plane.membership import (
     Membership,
     Outlived,
     Stall,
+    StallDetector,
 )
 from appliance.plane.settings import PlaneConfig
 
@@ -43,7 +44,7 @@ class Bench:
         self.now = 0.0
         self.done = asyncio.Event()
         self.outlived = Outlived(
-            cast("Pulse", self),
+            cast("StallDetector", self),
             lease_s=LEASE_S,
             members=self,
             answers=self.answers,
@@ -153,7 +154,7 @@ async def test_one_that_answers_or_has_gone_meanwhile_is_well() -> None:
         return await asked(name, timeout_s)
 
     bench.outlived = Outlived(
-        cast("Pulse", bench), lease_s=LEASE_S, members=bench, answers=gone, sees=bench.sees, renew=bench.renew,
+        cast("StallDetector", bench), lease_s=LEASE_S, members=bench, answers=gone, sees=bench.sees, renew=bench.renew,
         now=lambda: bench.now, pause=bench.pause,
     )  # fmt: skip
     bench.on_stalled = bench.on_stalled[1:]
@@ -172,7 +173,7 @@ async def test_a_look_that_is_under_way_is_not_begun_again() -> None:
         return await bench.answers(name, timeout_s)
 
     outlived = Outlived(
-        cast("Pulse", bench), lease_s=LEASE_S, members=bench, answers=slow, sees=bench.sees, renew=bench.renew,
+        cast("StallDetector", bench), lease_s=LEASE_S, members=bench, answers=slow, sees=bench.sees, renew=bench.renew,
         now=lambda: bench.now, pause=bench.pause,
     )  # fmt: skip
     tell = bench.on_stalled[-1]

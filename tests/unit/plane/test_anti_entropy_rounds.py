@@ -10,7 +10,7 @@ import pytest
 from appliance.plane import anti_entropy
 from appliance.plane.anti_entropy import DigestAsk, Reconciler, Step, StepKind
 from appliance.plane.dht import Absence, Dht
-from appliance.plane.membership import Membership
+from appliance.plane.membership import Membership, StallDetector
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
@@ -40,7 +40,7 @@ class Bench:
             rpc=cast("Rpc", self),
             membership=cast("Membership", self.membership),
             dht=cast("Dht", self),
-            pulse=cast("Pulse", SimpleNamespace(on_stalled=[], stalls=0)),
+            pulse=cast("StallDetector", SimpleNamespace(on_stalled=[], stalls=0)),
         )
 
     def register(self, *_: object, **__: object) -> None:

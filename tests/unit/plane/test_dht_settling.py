@@ -8,7 +8,7 @@ import pytest
 
 from appliance.plane import dht
 from appliance.plane.dht import Settling
-from appliance.plane.membership import Membership
+from appliance.plane.membership import Membership, StallDetector
 from appliance.plane.ring import Ring
 
 pytestmark = pytest.mark.anyio
@@ -21,7 +21,11 @@ OTHERS = next(key for number in range(1000) if RING.owner(key := f"key/{number}"
 def _settling() -> tuple[Settling, SimpleNamespace, SimpleNamespace]:
     membership, pulse = SimpleNamespace(ring=RING), SimpleNamespace(stalls=0)
     made = Settling(
-        gateway="a", membership=cast("Membership", membership), pulse=cast("Pulse", pulse), replicas=2, virtual_nodes=8
+        gateway="a",
+        membership=cast("Membership", membership),
+        pulse=cast("StallDetector", pulse),
+        replicas=2,
+        virtual_nodes=8,
     )
     return made, membership, pulse
 
