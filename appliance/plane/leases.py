@@ -161,7 +161,7 @@ def highest(fence: int, answers: Sequence[Granted]) -> int:
     return max(fence, *(answer.fence for answer in answers if answer.fence <= fence + _MOST_JUMP), 0)
 
 
-def holder(answers: Sequence[Granted], grantors: int) -> tuple[str, float] | None:
+def holder_of(answers: Sequence[Granted], grantors: int) -> tuple[str, float] | None:
     """Who else has the lease, as a majority says, and for how many seconds more; None: nobody is known to."""
     counts = Counter(answer.holder for answer in answers if answer.holder)
     for name, count in counts.most_common(1):
@@ -308,7 +308,7 @@ class Leases:
         until = _holder_clock() + ttl_s * (1 - _DRIFT)
 
         def enough(answers: list[Granted]) -> bool:
-            return granted(answers, len(grantors)) or holder(answers, len(grantors)) is not None
+            return granted(answers, len(grantors)) or holder_of(answers, len(grantors)) is not None
 
         answers = await self._poll(grantors, "lease_grant", ask, Granted, self.on_grant, enough)
         self._highest = highest(self._highest, answers)
@@ -319,7 +319,7 @@ class Leases:
     def _refuse(self, key: str, answers: list[Granted]) -> None:
         """Raise where asking again at once is of no use."""
         grantors = self.grantors(key)
-        if (other := holder(answers, len(grantors))) is not None:
+        if (other := holder_of(answers, len(grantors))) is not None:
             name, left_s = other
             raise ConflictError(f"{key} is leased to {name} for {left_s:.1f} s", remedy="try again then")
         if len(answers) < majority(len(grantors)):

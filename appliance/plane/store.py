@@ -270,7 +270,7 @@ def _rows(
     source: str,
     columns: str,
     prefix: str,
-    decoder: "msgspec.json.Decoder[list[T]]",
+    decoder: "msgspec.json.Decoder[list[Row]]",
     most: int,
     page_of: Page = Page(),  # noqa: B008 - immutable
 ) -> Iterator[Row]:

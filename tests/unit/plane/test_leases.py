@@ -6,7 +6,7 @@ import random
 import pytest
 
 from appliance.errors import PayloadError, RefusedError
-from appliance.plane.leases import LONGEST_S, Granted, Grantor, LeaseAsk, LeaseEnd, granted, highest, holder
+from appliance.plane.leases import LONGEST_S, Granted, Grantor, LeaseAsk, LeaseEnd, granted, highest, holder_of
 
 KEY = "reservation/aisle-3"
 GRANTORS = 3
@@ -136,7 +136,7 @@ def test_two_sides_of_a_cut_never_both_have_it() -> None:
     # Healed while the lease lasts: still refused, with who has it and for how long.
     answers = [each.grant(ask("b", 2), 4.0) for each in (one, two, three)]
     assert not granted(answers, 3)
-    assert holder(answers, 3) == ("a", 6.0)
+    assert holder_of(answers, 3) == ("a", 6.0)
     assert granted([each.grant(ask("b", 3), 10.0) for each in (one, two, three)], 3)
 
 
