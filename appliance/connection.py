@@ -1,17 +1,20 @@
 """A connection to a fleet: asks any gateway, and another one when that is gone. What is asked stands in `client`.
 
-It sits anywhere on the Zenoh network and knows nothing of a gateway's inside.
+It sits anywhere on the Zenoh network and knows nothing of a gateway's inside. The endpoints of a fleet that runs on
+this machine are found by its state file.
 """
 
 import asyncio
 import os
 import time
+from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
+import msgspec
 from msgspec import Struct
 
-from appliance.errors import DeadlineError, NotFoundError, SwiftbotError, UnreachableError
+from appliance.errors import ConfigError, DeadlineError, NotFoundError, SwiftbotError, UnreachableError
 from appliance.model.steering import MAX_BY
 from appliance.plane.node import PlaneClient
 from appliance.plane.settings import PlaneConfig
@@ -132,3 +135,53 @@ class FleetConnection:
         if not found:
             raise failed[min(failed)]
         return found
+
+
+class Process(Struct, frozen=True, kw_only=True):
+    """A process of the fleet; `started` (Unix seconds) tells it from another with the same pid later."""
+
+    name: str
+    pid: int
+    started: float
+    log: str
+
+
+class FleetState(Struct, frozen=True, kw_only=True):
+    """The state file `fleet.json` of a local fleet, in its directory."""
+
+    fleet: str
+    directory: str
+    endpoints: tuple[str, ...]
+    gateways: tuple[str, ...]
+    robots: tuple[str, ...]
+    record_dir: str
+    processes: tuple[Process, ...]
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """Where clients connect."""
+        return Endpoint(fleet=self.fleet, connect=self.endpoints)
+
+
+def default_directory(fleet: str) -> Path:
+    """Where a local fleet keeps its files: under XDG_STATE_HOME."""
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(state) / "swiftbot" / fleet
+
+
+def read_state(directory: Path) -> FleetState:
+    """Read a fleet's state file; NotFoundError when no fleet was started there."""
+    path = directory / "fleet.json"
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=FleetState)
+    except FileNotFoundError:
+        raise NotFoundError(
+            f"no fleet runs in {directory}",
+            remedy="name the endpoint of a gateway with --connect, or start a local fleet with `swiftbot up`",
+        ) from None
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}", remedy="give a --dir that is a readable folder"
+        ) from error
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"{path} cannot be read: {error}", remedy="remove it and start the fleet anew") from error

@@ -1,11 +1,12 @@
-"""How the command line shows things: plans as graphs, tasks, fleets. Prints only; decides nothing.
+"""How the command line shows things: plans as graphs, tasks and their streams, fleets. Prints only.
 
-Rich finds out whether it writes to a terminal: without one there are no colours and no live region.
+Of plans also where they came from, what they ask for, how they were revised, and what was learned from them. Rich finds
+out whether it writes to a terminal: without one there are no colours and no live region.
 """
 
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,14 +15,14 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from appliance.console_plan import analysis_text, provenance_text
-from appliance.console_watch import revision_lines
 from appliance.doctor import Check
+from appliance.llm.analysis import Analysis
 from appliance.model import (
     PLAIN_PRIORITY,
     ContainerInfo,
     GatewayStatus,
     Plan,
+    Provenance,
     RecorderNote,
     RobotInfo,
     SubtaskRecord,
@@ -36,10 +37,157 @@ from appliance.pool.transfer.api import Brought
 from appliance.reasons import milliseconds
 from appliance.record.models import LogInfo, kinds_text, problem_of, together
 from appliance.record.player import Played
-from appliance.tasks.api import PlanAnswer
+from appliance.tasks.api import ExperienceList, PlanAnswer
+from appliance.tasks.lines import Line, LineKind
 from appliance.tasks.replay import CheckReport, ReplayReport
 from appliance.tasks.retention import done_text
 from appliance.tasks.views import waits_for
+
+_LINE_STYLES = {
+    LineKind.STATE: "",
+    LineKind.MONITOR: "bold yellow",
+    LineKind.PROGRESS: "dim",
+    LineKind.LOG: "",
+    LineKind.GATEWAY: "dim",
+    LineKind.PARTIAL: "dim",
+    LineKind.CHECKPOINT: "dim",
+    LineKind.METRICS: "cyan",
+    LineKind.NOTICE: "bold",
+    LineKind.DROPPED: "bold red",
+}
+_LOG_LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
+_RUN_FIGURES = (("startup_ms", "startup"), ("duration_ms", "took"), ("cpu_ms", "cpu"), ("peak_mb", "peak"))
+
+
+def stream_line(line: Line) -> Text:
+    """One line of a stream: time, gateway, subtask/attempt, what it is, what it says."""
+    at = time.strftime("%H:%M:%S", time.localtime(line.at_ns / 1e9)) + f".{line.at_ns // 1_000_000 % 1000:03d}"
+    which = f"{line.subtask}/{line.attempt}" if line.attempt else line.subtask or "–"
+    style = _LOG_LEVEL_STYLES.get(line.level, _LINE_STYLES[line.kind])
+    text = line.text
+    if line.kind is LineKind.PROGRESS:
+        text = f"{line.fields.get('progress', 0.0):.0%} {line.text}"
+    elif line.kind is LineKind.METRICS:
+        text = f"{line.text}{_figures(line)}"
+    elif line.fields and line.kind in (LineKind.LOG, LineKind.GATEWAY, LineKind.PARTIAL):
+        text = f"{line.text} {' '.join(f'{name}={value}' for name, value in line.fields.items())}"
+    return Text.assemble((f"{at} ", "dim"), f"{line.gateway or '–':<8} {which:<8} {line.kind:<10} ", (text, style))
+
+
+def _figures(line: Line) -> str:
+    told: list[str] = []
+    for name, word in _RUN_FIGURES:
+        value = line.fields.get(name)
+        if isinstance(value, int | float) and name != "startup_ms":
+            told.append(f"{word} {value:g} {'MB' if name == 'peak_mb' else 'ms'}")
+    where = " ".join(str(line.fields[name])[:12] for name in ("container", "phase") if name in line.fields)
+    return f" ({', '.join([*told, where] if where else told)})" if told or where else ""
+
+
+def revision_lines(record: TaskRecord) -> Iterator[Text]:
+    """What was changed about a task's plan, and why; what waits for an operator, and what operators ordered."""
+    if record.paused:
+        yield Text(f"  {record.paused}", style="bold yellow")
+    if record.cancelled_by is not None and record.cancelled_by.by:
+        said = f": {record.cancelled_by.why}" if record.cancelled_by.why else ""
+        yield Text(f"  cancelled by {record.cancelled_by.by}{said}", style="magenta")
+    if record.retried_by is not None:
+        said = f": {record.retried_by.why}" if record.retried_by.why else ""
+        yield Text(f"  tried again by {record.retried_by.by or 'an operator'}{said}", style="dim")
+    if (decision := record.decision) is not None:
+        did = "approved" if decision.approved else "turned down"
+        edited = ", edited" if decision.edited else ""
+        said = f": {decision.why}" if decision.why else ""
+        yield Text(f"  plan {did}{edited} by {decision.by or 'an operator'}{said}", style="dim")
+    for each in record.revisions:
+        yield Text(f"  revision {each.number} ({each.kind}): {each.note}", style="yellow")
+        if each.why:
+            yield Text(f"    since {each.subtask} failed: {each.why}", style="dim")
+        changes = [f"{one.id} ({one.skill}) {one.state}" for one in each.dropped]
+        if changes or each.added:
+            yield Text(f"    out: {', '.join(changes) or 'none'}; in: {', '.join(each.added) or 'none'}", style="dim")
+    if record.proposal is not None:
+        short = record.proposal.hash[:12]
+        waits = (
+            f"\n  waits for `swiftbot task approve {record.id} --hash {short}` or `task reject {record.id}`"
+            if record.proposal.waits
+            else ""
+        )
+        yield Text(f"  proposed: {record.proposal.note}{waits}", style="bold yellow")
+        for each in record.proposal.plan.subtasks:
+            after = f" after {', '.join(each.after)}" if each.after else ""
+            yield Text(f"    {each.id} {each.skill} {each.robot or '–'} {each.params}{after}")
+    for each in record.subtasks:
+        if each.condition:
+            yield Text(f"  {each.subtask.id} is {each.condition}: {each.note}", style="yellow")
+
+
+def provenance_text(found: Provenance) -> Text:
+    """Where a plan came from, in a few lines."""
+    by = f"{found.tier}{f' ({found.model})' if found.model else ''}"
+    lines = [f"by {by} on {found.gateway or 'this machine'}, {found.confidence:.2f} sure, hash {found.hash[:12]}"]
+    if found.cache:
+        lines.append(f"from the cache: {found.cache}")
+    lines += [
+        f"  {each.tier}: {'taken' if each.ok else 'not taken'}, {each.latency_ms:.0f} ms"
+        f"{f': {each.problems[0]}' if each.problems else ''}"
+        for each in found.attempts
+    ]
+    lines += [
+        f"{'held' if each.severity == 'hold' else each.severity}: {each.message} [{each.check}]"
+        f"{f'; hint: {each.hint}' if each.hint else ''}"
+        for each in found.findings
+    ]
+    return Text("\n".join(lines))
+
+
+def analysis_text(found: Analysis) -> Group:
+    """What an instruction asks for, beside its plan."""
+    lines = [
+        f"{each.kind}: {each.text}{f' ({each.value:g} {each.unit})' if each.value is not None else ''}"
+        for each in found.constraints
+    ]
+    for each in found.able:
+        last = "".join(f"; {robot} last: {why}" for robot, why in each.shunned.items())
+        lines.append(f"{each.label}: {', '.join(each.robots) or 'no robot that is known'} can do it{last}")
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("image", "containers", "cpu", "memory", "volumes", "from", "for", "subtasks"):
+        table.add_column(name, overflow="fold")
+    for each in found.allocation:
+        table.add_row(
+            each.image,
+            str(each.count),
+            f"{each.cpu:g}",
+            f"{each.memory_mb} MB{f' (seen {each.seen_mb:.0f})' if each.seen_mb else ''}",
+            ", ".join(each.volumes) or "–",
+            f"{each.start_s:.0f} s",
+            f"{each.busy_s:.0f} s",
+            ", ".join(each.subtasks),
+        )
+    head = Text(f"expected to take {found.expected_s:.0f} s when nothing waits; containers it will need:", style="bold")
+    return Group(*(Text(line) for line in lines), head, table)
+
+
+def experience_table(found: ExperienceList) -> Group:
+    """How skills have done on robots."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("skill", "robot", "good", "bad", "reliable", "takes", "memory", "latest failure"):
+        table.add_column(name, overflow="fold")
+    for row in found.rows:
+        table.add_row(
+            row.skill,
+            row.robot or "–",
+            f"{row.good:.1f}",
+            f"{row.bad:.1f}",
+            f"{100 * row.reliability:.0f} %{' (chosen last)' if row.shunned else ''}",
+            f"{row.expected_s:.1f} s" if row.expected_s is not None else "–",
+            f"{row.peak_mb:.0f} MB" if row.peak_mb else "–",
+            row.why or "–",
+        )
+    moved = ", ".join(f"{tier} {value:.2f}" for tier, value in found.thresholds.items())
+    tail = Text(f"plans run unasked from: {moved or '–'}")
+    return Group(Text(f"as {found.gateway} has heard", style="bold"), table, tail)
+
 
 PIPE_WIDTH = 160
 """Columns where there is no terminal to ask: logs and CI wrap by themselves, if at all."""

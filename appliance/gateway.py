@@ -3,6 +3,9 @@
 Order: plane (others can find us) → language model → robots → pool → tasks; the gateway takes part in the ring
 from the first step but accepts runs only when its pool is there. On SIGTERM: say that we drain, let runs end,
 hand over coordination (the next owner of each key goes on), leave the warm containers for the next start.
+
+State volumes and images (`StateHere`): their parts are the pool's (`pool.volumes`, `pool.transfer`); here they are
+built, told of what others hold, and asked what this gateway says of itself; there are none without Podman.
 """
 
 import asyncio
@@ -12,20 +15,21 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance import logs, service
+from appliance import logs, process
 from appliance.config import GatewayConfig
-from appliance.errors import ConfigError
-from appliance.limits import orders_of
+from appliance.errors import ConfigError, PrerequisiteError
 from appliance.llm.api import SwapAsk, Swapped
 from appliance.llm.cascade import Decomposer
+from appliance.llm.checks.policy import strictest
 from appliance.llm.peers import PeerTier, ProposeAsk, Proposed
 from appliance.llm.settings import PlanContext
 from appliance.model import (
@@ -36,22 +40,29 @@ from appliance.model import (
     Need,
     Plan,
     PoolHint,
+    RobotInfo,
     RunRequest,
     Site,
+    VolumeInfo,
 )
 from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
+from appliance.pool.settings import PoolConfig
+from appliance.pool.state import ALONE, State
+from appliance.pool.storage import PodmanStorage
+from appliance.pool.transfer.transfers import Transfers
+from appliance.pool.volumes import Volumes
+from appliance.process import Vitals
 from appliance.record.models import Recorders, RecorderStatus
 from appliance.robot_tasks import RobotTasks
 from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.authority.authority import SHOWN, Authority
 from appliance.robots.hub import RobotHub
-from appliance.robots.limits import Orders
+from appliance.robots.limits import Bounds, Orders, Usual
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
-from appliance.state_here import StateHere
 from appliance.tasks.api import ArtifactAsk, RunAsk, SiteAsk, TaskLinesAsk
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.audit import Audit
@@ -62,12 +73,116 @@ from appliance.tasks.manager import TaskManager
 from appliance.tasks.migration.gateway import Migration
 from appliance.tasks.migration.handoff import Leaving
 from appliance.tasks.migration.policy import Load
-from appliance.tasks.offload import RemoteContainers
+from appliance.tasks.offload import Links, RemoteContainers, UnmeasuredLinks
 from appliance.tasks.retention import Retention
 from appliance.tasks.stream import Kept
-from appliance.vitals import Vitals
+
+
+def orders_of(config: GatewayConfig, site: Site, *, roster: Callable[[], Mapping[str, RobotInfo]]) -> Orders:
+    """Return it; `roster` gives the robots as they are known when an order is given."""
+    robots, limits = config.robots, config.safety.limits
+
+    def configured(robot: str) -> Bounds:
+        return Bounds(
+            whose=f"the limits of {robot} in [safety]",
+            speed_mps=strictest(limits, robot, "speed_mps"),
+            altitude_m=strictest(limits, robot, "altitude_m"),
+        )
+
+    def vehicles(flies: bool) -> Usual:
+        return Usual(speed_mps=robots.cruise_mps if flies else robots.drive_mps, takeoff_m=robots.takeoff_altitude_m)
+
+    return Orders(site, roster=roster, configured=configured, vehicles=vehicles)
+
 
 log = structlog.get_logger(__name__)
+
+
+class StateHere:
+    """The ledger of state volumes, and the transfers of them and of images; `open` it, `close` it in any case."""
+
+    def __init__(
+        self, config: PoolConfig, *, plane: Plane, fleet: str, data_dir: Path, on_change: Callable[[], None]
+    ) -> None:
+        self.state: State = ALONE
+        """What the pool may do with state; nothing without Podman."""
+        self.links: Links = UnmeasuredLinks()
+        """How fast others are reached."""
+        self._config = config
+        self._plane = plane
+        self._fleet = fleet
+        self._data = data_dir
+        self._on_change = on_change
+        self._volumes: Volumes | None = None
+        self._transfers: Transfers | None = None
+        self._stack = contextlib.AsyncExitStack()
+
+    async def open(self, signed: Callable[[str, Any], Any] = lambda _, handler: handler) -> None:
+        """Build and start the parts.
+
+        Args:
+            signed: puts an audit around the handler of an operator's verb.
+        """
+        try:
+            storage = PodmanStorage(self._config.podman_url)
+        except PrerequisiteError as error:
+            log.warning("state volumes and images cannot be moved", reason=str(error))
+            return
+
+        async def let_go() -> None:
+            await asyncio.to_thread(storage.close)
+
+        self._stack.push_async_callback(let_go)
+        plane, settings = self._plane, self._config.transfer
+        self._volumes = volumes = Volumes(
+            settings, fleet=self._fleet, gateway=plane.gateway, store=plane.store, records=plane.dht, storage=storage
+        )
+        await volumes.start()
+        self._stack.push_async_callback(volumes.close)
+        volumes.on_change = self._on_change
+        plane.registry.on_change.append(self._hear_of_volumes)
+        plane.on_member_lost.append(lambda gateway: volumes.hear(gateway, ()))
+        self._transfers = transfers = Transfers(
+            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data
+        )
+        await transfers.start(signed)
+        self._stack.push_async_callback(transfers.close)
+        transfers.on_change = self._on_change
+        self.state = State(
+            bring=transfers.bring_newest,
+            use=volumes.use,
+            newest_here=volumes.newest_here,
+            bring_image=transfers.bring_image,
+        )
+        self.links = transfers
+
+    def _hear_of_volumes(self, what: str) -> None:
+        if what == "gateway" and self._volumes is not None:
+            for gateway, status in self._plane.registry.gateways.items():
+                if gateway != self._plane.gateway:
+                    self._volumes.hear(gateway, status.volumes)
+
+    def volumes_mb(self, names: Iterable[str]) -> float:
+        """Size of the newest states of volumes that are not here, MiB: what would have to come."""
+        return self._volumes.size_bytes(names) / 2**20 if self._volumes is not None else 0.0
+
+    def volumes(self) -> tuple[VolumeInfo, ...]:
+        """The volumes whose newest state is here."""
+        return self._volumes.infos() if self._volumes is not None else ()
+
+    def images(self) -> tuple[str, ...]:
+        """References of the images here that others may fetch."""
+        return self._transfers.images() if self._transfers is not None else ()
+
+    @property
+    def refused(self) -> list[dict[str, int]]:
+        """Counts of bad input, by kind."""
+        return [each.refused for each in (self._volumes, self._transfers) if each is not None]
+
+    async def close(self) -> None:
+        """Stop the parts in reverse order."""
+        await self._stack.aclose()
+
 
 VERSION = "0.1.0"
 SETTLE_S = 3.0
@@ -455,8 +570,8 @@ async def run(config: GatewayConfig) -> None:
         loop.add_signal_handler(number, stop.set)
     gateway = Gateway(config)
     await gateway.start()
-    service.ready()
-    watchdog = asyncio.create_task(service.keep_alive(), name="watchdog")
+    process.ready()
+    watchdog = asyncio.create_task(process.keep_alive(), name="watchdog")
     stopped = asyncio.create_task(stop.wait(), name="stopped")
     displaced = asyncio.create_task(gateway.plane.displaced(), name="displaced")
     problem: ConfigError | None = None
@@ -468,7 +583,7 @@ async def run(config: GatewayConfig) -> None:
     finally:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.remove_signal_handler(number)
-        service.stopping()
+        process.stopping()
         try:
             # Two that answer the same questions can give nothing away in good order.
             await gateway.stop(at_once=problem is not None)

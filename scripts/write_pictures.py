@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from appliance.client import FleetClient  # noqa: E402
-from appliance.fleet_state import FleetState  # noqa: E402
+from appliance.connection import FleetState  # noqa: E402
 from appliance.model import Approval, TaskRequest  # noqa: E402
 from appliance.plane.settings import PlaneConfig  # noqa: E402
 from appliance.pool.settings import PoolConfig  # noqa: E402

@@ -13,10 +13,10 @@ from pathlib import Path
 from rich.text import Text
 
 from appliance import console
-from appliance.cli.submitting import follow
+from appliance.cli.task import follow
 from appliance.client import FleetClient
+from appliance.connection import FleetState
 from appliance.errors import SwiftbotError
-from appliance.fleet_state import FleetState
 from appliance.model import TaskRecord, TaskRequest, TaskState
 from appliance.plane.settings import PlaneConfig
 from appliance.tasks.replay import ReplayReport, replay

@@ -22,6 +22,7 @@ from msgspec import Struct
 from appliance import config as configuration
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.connection import FleetState, Process, read_state
 from appliance.errors import (
     ConfigError,
     DeadlineError,
@@ -30,7 +31,6 @@ from appliance.errors import (
     SwiftbotError,
     UnreachableError,
 )
-from appliance.fleet_state import FleetState, Process, read_state
 from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig

@@ -9,37 +9,23 @@ from cyclopts import App, CycloptsError
 from rich.markup import escape
 
 from appliance import console, logs
-from appliance.cli import (
-    conformance,
-    daemons,
-    hands,
-    moves,
-    plane,
-    planning,
-    plugins,
-    pool,
-    recordings,
-    robots,
-    steer,
-    tools,
-    work,
-)
+from appliance.cli import daemons, log, plan, plane, plugins, pool, robots, steer, task, tools
 from appliance.errors import Exit, SwiftbotError
 
 app = App(
     name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
 )
 for part in (
-    work,
-    planning,
-    moves,
+    task,
+    plan,
+    task,
     steer,
     daemons,
     pool,
     robots,
-    hands,
-    conformance,
-    recordings,
+    robots,
+    robots,
+    log,
     plane,
     tools,
     plugins,

@@ -41,7 +41,7 @@ class Where:
 
     def folder(self) -> Path:
         """Directory of the local fleet of that name."""
-        from appliance.fleet_state import default_directory
+        from appliance.connection import default_directory
 
         return self.directory or default_directory(self.fleet)
 
@@ -49,7 +49,7 @@ class Where:
         """Where to connect: as told, or what the local fleet's state file says."""
         if self.connect:
             return Endpoint(fleet=self.fleet, connect=self.connect)
-        from appliance.fleet_state import read_state
+        from appliance.connection import read_state
 
         return read_state(self.folder()).endpoint
 

@@ -10,7 +10,7 @@ import msgspec
 import uvloop
 from cyclopts import App, Parameter
 
-from appliance import logs, service
+from appliance import logs, process
 from appliance.cli.common import DAEMONS, HERE, Where
 
 
@@ -28,7 +28,7 @@ def gateway(*, config: Path) -> int:
     """
     from appliance import config as configuration
     from appliance import gateway as daemon
-    from appliance.collector import gentle_collector
+    from appliance.process import gentle_collector
 
     loaded = configuration.load(config)
     logs.configure(level=loaded.log_level, style=loaded.log_format)
@@ -64,7 +64,7 @@ def router(
 
     async def go() -> None:
         plane = PlaneConfig(mode="router", listen=listen, connect=connect, lease_ms=lease_ms)
-        await run_router(plane, stop=until_signalled(), ready=lambda _: service.ready(), alive=service.alive)
+        await run_router(plane, stop=until_signalled(), ready=lambda _: process.ready(), alive=process.alive)
 
     uvloop.run(go())
     return 0
@@ -153,8 +153,8 @@ def foxglove(
 
 
 def _tell_systemd(_: object) -> None:
-    service.ready()
-    service.alive()
+    process.ready()
+    process.alive()
 
 
 def until_signalled() -> asyncio.Event:

@@ -1,4 +1,4 @@
-"""Records of the plane: `swiftbot plane …`."""
+"""Records of the plane: `swiftbot plane …`, and how records are shown."""
 
 import asyncio
 import sys
@@ -7,10 +7,54 @@ from typing import Annotated, Any
 
 import msgspec
 from cyclopts import App, Parameter
+from rich.table import Table
 
 from appliance import console
 from appliance.cli.common import HERE, TOOLS, Json, Where, show
 from appliance.errors import ConfigError, Exit, NotFoundError, PayloadError
+from appliance.plane.dht import Copy, RecordPlace
+from appliance.plane.records import Record
+from appliance.records import Held
+
+
+def place_table(record: Record, place: RecordPlace, how: str) -> Table:
+    """A record's version, and its copies."""
+    title = f"{record.key} at {_version(record.version)}, read from {how}; owner {place.owner}"
+    table = Table(title=title, title_justify="left", caption=_caption(place), caption_justify="left")
+    for name in ("gateway", "version", "bytes", "state"):
+        table.add_column(name)
+    for each in place.copies:
+        table.add_row(each.gateway, _version(each.version), str(each.size_bytes), _state(each))
+    return table
+
+
+def _caption(place: RecordPlace) -> str:
+    return "the copies agree" if place.agree else "the copies differ"
+
+
+def held_table(held: list[Held]) -> Table:
+    """Records and where their copies lie."""
+    table = Table()
+    for name in ("key", "version", "bytes", "owner", "copies at", ""):
+        table.add_column(name)
+    for each in held:
+        newest = each.newest
+        copies = ", ".join(copy.gateway for copy in each.copies)
+        notes = [*(["removed"] if newest.deleted else []), *([] if each.agree else ["copies differ"])]
+        row = (each.key, _version(newest.version), str(newest.size_bytes), each.owner, copies, ", ".join(notes))
+        table.add_row(*row)
+    return table
+
+
+def _state(copy: Copy) -> str:
+    if copy.problem:
+        return copy.problem
+    return "removed" if copy.deleted else "" if copy.version else "none"
+
+
+def _version(version: dict[str, int]) -> str:
+    return msgspec.json.encode(version).decode() if version else ""
+
 
 plane_app = App(name="plane", help="Records of the fleet's plane: read, list, compare and set.", group=TOOLS)
 
@@ -42,7 +86,6 @@ def get(
     Args:
         key: Of the record, such as task/t-1f3a.
     """
-    from appliance.cli.records import place_table
     from appliance.records import How, Records
 
     how: How = "replica" if replica else "owner"
@@ -96,7 +139,7 @@ def put(
 
     async def go() -> Any:
         async with Records(where.endpoint()) as records:
-            expected = _version(expect) if expect else None
+            expected = _read_version(expect) if expect else None
             if not new and not expect:
                 try:
                     expected = (await records.read(key)).version
@@ -127,7 +170,7 @@ def rm(
 
     async def go() -> Any:
         async with Records(where.endpoint()) as records:
-            expected = _version(expect) if expect else (await records.read(key)).version
+            expected = _read_version(expect) if expect else (await records.read(key)).version
             return await records.remove(key, expected=expected, force=force)
 
     _tell_version(key, asyncio.run(go()), as_json=as_json)
@@ -150,7 +193,6 @@ def ls(
         prefix: Only keys that begin so.
         limit: At most so many, 1 to 1,000.
     """
-    from appliance.cli.records import held_table
     from appliance.plane.dht import MOST_LISTED
     from appliance.records import Records
 
@@ -170,7 +212,7 @@ def ls(
     return Exit.UNREACHABLE if failed else Exit.DONE
 
 
-def _version(text: str) -> dict[str, int]:
+def _read_version(text: str) -> dict[str, int]:
     try:
         return msgspec.json.decode(text, type=dict[str, int])
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

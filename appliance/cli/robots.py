@@ -1,19 +1,28 @@
-"""Robots: `swiftbot robots …`."""
+"""Robots: `swiftbot robots …`: who there is, MAVLink links, taking one over by hand, conformance of its program."""
 
 import asyncio
 import getpass
 import os
 import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
+from cyclopts.validators import Number
+from rich.console import Group
+from rich.markup import escape
+from rich.table import Table
 
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, show
 from appliance.client import FleetClient
-from appliance.errors import ConfigError, Exit, RefusedError, SwiftbotError
-from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, RobotForget
+from appliance.errors import ConfigError, ConflictError, Exit, NotFoundError, RefusedError, SwiftbotError
+from appliance.model import Lease, RobotReply, SubtaskState, TaskState
+from appliance.plane.keys import check_name
+from appliance.robots.api import LEASE_S, Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, RobotForget
+from appliance.robots.conformance import Conformance, Operator, Report, Seen, is_present
 from appliance.robots.settings import MavlinkLink
 
 robots_app = App(name="robots", help="Robots: who there is, their MAVLink links, and buttons.", group=WORK)
@@ -68,7 +77,6 @@ Gateway = Annotated[str, Parameter(help="The gateway; needed only where there ar
 @links_app.command(name="list")
 def robots_links(*, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
     """Show MAVLink links: rates, senders with their losses, latency, what was refused, routes."""
-    from appliance.cli.links import links_tables
 
     async def go() -> tuple[dict[str, LinkList], dict[str, SwiftbotError]]:
         async with FleetClient(where.endpoint()) as client:
@@ -191,3 +199,256 @@ def robots_qgc_actions(*, config: Path, out: Path | None = None) -> int:
         raise ConfigError(f"{out} cannot be written: {error.strerror}", remedy="name another file") from error
     console.out.print(f"{out}: {len(robots.templates)} tasks", markup=False)
     return 0
+
+
+def links_tables(found: Mapping[str, LinkList]) -> Group:
+    """Return a table of the links, one of their senders, and one of the routes."""
+    links = Table("gateway", "link", "ends", "in/s", "out/s", "B/s in", "latency ms", "refused", "", box=None)
+    senders = Table("gateway", "link", "sender", "frames", "lost", "loss", "late", "repeated", "silent s", box=None)
+    routes = Table("gateway", "sender", "was heard last on", box=None)
+    for name, each in sorted(found.items()):
+        for link in each.links:
+            links.add_row(name, link.url, str(len(link.ends)), *_figures(link), _note(link))
+            for one in link.senders:
+                senders.add_row(
+                    name, link.url, f"{one.system}/{one.component}", f"{one.received:,}", f"{one.lost:,}",
+                    f"{one.loss:.1%}", str(one.late), str(one.repeated), f"{one.silent_s:g}",
+                )  # fmt: skip
+        for sender, where in each.routes.items():
+            routes.add_row(name, sender, where)
+    return Group(*(each for each in (links, senders, routes) if each is links or each.row_count))
+
+
+def _figures(link: LinkFacts) -> tuple[str, str, str, str, str]:
+    refused = sum(link.refused.values())
+    latency = ", ".join(f"{each.mean_ms:.1f}" for each in link.latency) or "–"
+    return f"{link.in_hz:,.0f}", f"{link.out_hz:,.0f}", f"{link.in_bytes_s:,.0f}", latency, f"{refused:,}"
+
+
+def _note(link: LinkFacts) -> str:
+    """Return what else is to be said of a link."""
+    said = ["listens" if link.listens else "connects"]
+    if link.signed:
+        said.append("signed")
+    if link.added:
+        said.append("added at run time")
+    if link.problem:
+        said.append(link.problem)
+    said += [f"a storm of {each} is damped" for each in link.damped]
+    return ", ".join(said + [f"{kind} {count}" for kind, count in sorted(link.refused.items())])
+
+
+STEP_S = 0.5
+
+LeaseId = Annotated[str, Parameter(name="--lease", help="Id of the lease, as `robots take` printed it.")]
+
+
+def add_hands_to(app: App) -> None:
+    """Add these commands; they hang below `robots`."""
+    del app
+
+
+@robots_app.command(name="take")
+def robots_take(
+    robot: str,
+    *,
+    lease: Annotated[float, Parameter(help="Seconds until it ends by itself.", validator=Number(gte=1, lte=120))] = (
+        3 * LEASE_S
+    ),
+    why: str = "",
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Take a robot over: it holds, its tasks wait, and only commands with the lease move it until that ends.
+
+    Args:
+        robot: Which robot.
+        lease: Seconds until it ends by itself.
+        why: Why, for the audit and for the tasks that wait.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            found = await client.take_over(robot, lease_s=lease, why=why)
+        text = f"{robot} is yours for {found.lease_s:g} s: --lease {found.id}"
+        show(found, as_json=as_json, table=text)
+
+    asyncio.run(go())
+    return 0
+
+
+@robots_app.command(name="renew")
+def robots_renew(robot: str, *, lease: LeaseId, as_json: Json = False, where: Where = HERE) -> int:
+    """Keep a robot that was taken over for as long again."""
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            found = await client.renew(Lease(id=lease, robot=robot))
+        show(found, as_json=as_json, table=f"{robot} is yours for {found.lease_s:g} s more")
+
+    asyncio.run(go())
+    return 0
+
+
+@robots_app.command(name="move")
+def robots_move(
+    robot: str,
+    *,
+    lease: LeaseId,
+    forward: float = 0.0,
+    left: float = 0.0,
+    up: float = 0.0,
+    turn: float = 0.0,
+    seconds: Annotated[float, Parameter(name="--for", validator=Number(gt=0, lte=60))] = 0.5,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Move a robot that was taken over; it holds when the time is over, or this command ends.
+
+    Args:
+        robot: Which robot.
+        lease: The lease.
+        forward: Metres a second ahead; negative: back.
+        left: To its left; negative: to its right.
+        up: Up, of one that flies.
+        turn: Degrees a second to the right.
+        seconds: For how long.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+    velocity = {"forward_mps": forward, "left_mps": left, "up_mps": up, "turn_dps": turn}
+
+    async def go() -> RobotReply:
+        async with FleetClient(where.endpoint()) as client:
+            held = Lease(id=lease, robot=robot)
+            until = time.monotonic() + seconds
+            while True:
+                left_s = until - time.monotonic()
+                for_s = max(0.05, min(STEP_S, left_s))
+                reply = await client.drive(held, "velocity", **velocity, for_s=for_s)
+                if left_s <= STEP_S:
+                    return reply
+                await client.renew(held)
+
+    reply = asyncio.run(go())
+    show(reply.result, as_json=as_json, table=f"{robot} is at {reply.result.get('pose')}")
+    return 0
+
+
+@robots_app.command(name="give")
+def robots_give(robot: str, *, lease: LeaseId, why: str = "", as_json: Json = False, where: Where = HERE) -> int:
+    """Give a robot back to the tasks; it holds first.
+
+    Args:
+        robot: Which robot.
+        lease: The lease.
+        why: Why, for the audit.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+
+    async def go() -> None:
+        async with FleetClient(where.endpoint()) as client:
+            found = await client.give_back(Lease(id=lease, robot=robot), why=why)
+        show(found, as_json=as_json, table=f"{robot} is {found.ended}")
+
+    asyncio.run(go())
+    return 0
+
+
+_LEASE_S = 60.0
+_WHY = "conformance check"
+_GOTO_S = 30.0
+_SLOW_S = 2.0
+_MARKS = {"passed": "[green]✔[/green]", "failed": "[red]✘[/red]", "skipped": "[yellow]–[/yellow]"}
+
+
+def add_conformance_to(app: App) -> None:
+    """Add this command; it hangs below `robots`."""
+    del app
+
+
+@robots_app.command(name="check")
+def robots_check(
+    robot: str,
+    *,
+    moves: Annotated[bool, Parameter(negative="", help="Drive the robot a metre and back, too.")] = False,
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Check that the program of a robot that speaks Zenoh keeps to the contract (docs/robot-contract.md).
+
+    The robot does not move, unless --moves is given; it holds for about half a minute, under a lease, so that no task
+    commands it. Ends with exit code 1 when a check fails.
+
+    Args:
+        robot: Its name, as the list shows it.
+    """
+    check_name(robot, "robot")
+    console_of = console.err if as_json else console.out
+
+    def begin(name: str, about_s: float) -> None:
+        if about_s >= _SLOW_S:
+            console_of.print(f"  [dim]{name}: about {about_s:.0f} s …[/dim]", markup=True)
+
+    def seen(one: Seen) -> None:
+        console_of.print(f"{_MARKS[one.outcome]} {one.check}: {escape(one.what)}", markup=True, highlight=False)
+        if one.remedy:
+            console_of.print(f"  remedy: {one.remedy}", markup=False, highlight=False)
+
+    async def go() -> Report:
+        async with FleetClient(where.endpoint()) as client:
+            await client.gateway()
+            await _may_be_checked(client, robot)
+            checks = Conformance(client.plane.session, robot, _operator(client, robot), on_begin=begin, on_seen=seen)
+            return await checks.run(moves=moves)
+
+    report = asyncio.run(go())
+    if as_json:
+        show(report, as_json=True)
+    else:
+        failed = sum(each.outcome == "failed" for each in report.checks)
+        verdict = "keeps to the contract" if report.passed else f"fails {failed} of {len(report.checks)} checks"
+        console.out.print(f"{robot} {verdict}", markup=False, highlight=False)
+    return Exit.DONE if report.passed else Exit.FAILED
+
+
+async def _may_be_checked(client: FleetClient, robot: str) -> None:
+    """Raise where there is no such robot, its gateway answers for it, or a task has it."""
+    info = client.plane.registry.robots.get(robot)
+    if info is None:
+        if not await is_present(client.plane.session, robot):
+            known = ", ".join(sorted(client.plane.registry.robots)) or "none"
+            raise NotFoundError(f"no robot {robot[:60]!r}", remedy=f"there are: {known}")
+        return
+    if info.gateway or info.kind == "mavlink":
+        raise RefusedError(
+            f"{robot} is a MAVLink vehicle, for which {info.gateway or 'a gateway'} answers",
+            remedy="check a robot that speaks Zenoh itself",
+        )
+    for task in (await client.tasks(200)).tasks:
+        if task.state is TaskState.RUNNING and any(
+            each.state is SubtaskState.RUNNING and robot in (each.bound_robot, each.subtask.robot)
+            for each in task.subtasks
+        ):
+            raise ConflictError(f"{robot} is busy with task {task.id}", remedy="wait for its end, or cancel it")
+
+
+def _operator(client: FleetClient, robot: str) -> Operator:
+    held: list[Lease] = []
+
+    async def take() -> str:
+        held.append(await client.take_over(robot, lease_s=_LEASE_S, why=_WHY))
+        return held[0].id
+
+    async def drive(x: float, y: float) -> object:
+        return await client.drive(held[0], "goto", timeout_s=_GOTO_S, waypoints=[{"x": x, "y": y}], speed_mps=0.5)
+
+    return Operator(
+        take=take,
+        keep=lambda: client.renew(held[0]),
+        drive=drive,
+        give_back=lambda: client.give_back(held[0], why=_WHY),
+    )

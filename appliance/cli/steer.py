@@ -1,6 +1,6 @@
 """Steer a fleet: `swiftbot stop`, `resume`, `standing`, `acts`, `asks`, `answer`, `llm swap`.
 
-And of `task`: `approve`, `reject`, `check`, `pause`, `resume`, `retry`. Robots are taken over by `hands`.
+And of `task`: `approve`, `reject`, `check`, `pause`, `resume`, `retry`. Robots are taken over by `robots take`.
 """
 
 import asyncio
@@ -14,16 +14,15 @@ from cyclopts import App, Parameter
 
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
-from appliance.cli.work import task_app
-from appliance.client import FleetClient
+from appliance.cli.task import task_app
+from appliance.client import FleetClient, read_plan_file
 from appliance.errors import ConfigError, Exit, SwiftbotError
 from appliance.model import Plan, TaskRecord
 from appliance.robots.api import StopAnswer
-from appliance.steering import read_plan_file
 from appliance.tasks.views import view
 
 if TYPE_CHECKING:
-    from appliance.stopping import Stopped
+    from appliance.client import Stopped
 
 llm_app = App(name="llm", help="Language models of gateways.", group=WORK)
 
@@ -162,7 +161,7 @@ def stop(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE
 
 def carry_out_stop(names: tuple[str, ...], *, why: str, as_json: bool, where: Where) -> int:
     """Stop the robots of these names, all when there are none, and print what came of it."""
-    from appliance.stopping import Stopped
+    from appliance.client import Stopped
 
     async def go() -> Stopped:
         async with FleetClient(where.endpoint()) as client:
@@ -194,7 +193,7 @@ def show_stopped(done: "Stopped", *, as_json: bool) -> int:
 
 def resume(*robots: str, why: Why = "", as_json: Json = False, where: Where = HERE) -> int:
     """Lift soft stops: of these robots, or all of them; the tasks go on. Exit code 1 when a gateway did not confirm."""
-    from appliance.stopping import answer_text
+    from appliance.client import answer_text
 
     async def go() -> StopAnswer:
         async with FleetClient(where.endpoint()) as client:

@@ -7,35 +7,19 @@ nanoseconds for people and logs, never compared between gateways to decide anyth
 """
 
 from appliance.model.gateways import (
+    CacheFigures,
     ContainerInfo,
     ContainerState,
     GatewayStatus,
+    PlannerStatus,
     PoolHint,
     RecorderNote,
-    VolumeInfo,
-)
-from appliance.model.messages import (
-    ErrorReply,
-    Failure,
-    LogLine,
-    Notice,
-    VersionVector,
-    encode,
-)
-from appliance.model.placement import (
-    Choice,
-    Considered,
-    Need,
-    Phase,
-    Way,
-)
-from appliance.model.planner import (
-    CacheFigures,
-    PlannerStatus,
     SlotStatus,
     TierFigures,
     UpstreamStatus,
+    VolumeInfo,
 )
+from appliance.model.messages import ErrorReply, Failure, LogLine, Notice, VersionVector, encode
 from appliance.model.plans import (
     MAX_SUBTASKS,
     SPLIT,
@@ -50,44 +34,8 @@ from appliance.model.plans import (
     oversize,
     plan_hash,
 )
-from appliance.model.requests import (
-    HIGHEST_PRIORITY,
-    LONGEST_DEADLINE_S,
-    PLAIN_PRIORITY,
-    TaskRequest,
-)
-from appliance.model.revisions import (
-    Dropped,
-    Proposal,
-    Revision,
-    RevisionKind,
-)
-from appliance.model.robots import (
-    Pose,
-    RobotCommand,
-    RobotInfo,
-    RobotLimits,
-    RobotReply,
-)
-from appliance.model.runs import (
-    RunAccepted,
-    RunEvent,
-    RunEventKind,
-    RunRequest,
-)
-from appliance.model.site import (
-    Box,
-    Device,
-    Door,
-    Person,
-    Place,
-    Site,
-    SiteObject,
-)
-from appliance.model.states import (
-    SubtaskState,
-    TaskState,
-)
+from appliance.model.robots import Pose, RobotCommand, RobotInfo, RobotLimits, RobotReply
+from appliance.model.site import Box, Device, Door, Person, Place, Site, SiteObject
 from appliance.model.steering import (
     Act,
     Approval,
@@ -101,14 +49,33 @@ from appliance.model.steering import (
     Word,
 )
 from appliance.model.tasks import (
+    HIGHEST_PRIORITY,
+    LONGEST_DEADLINE_S,
+    PLAIN_PRIORITY,
     Attempt,
+    Choice,
+    Considered,
+    Dropped,
     Group,
     LostOrder,
     LostRun,
+    Need,
+    Phase,
+    Proposal,
     Remembered,
+    Revision,
+    RevisionKind,
+    RunAccepted,
+    RunEvent,
+    RunEventKind,
+    RunRequest,
     Split,
     SubtaskRecord,
+    SubtaskState,
     TaskRecord,
+    TaskRequest,
+    TaskState,
+    Way,
 )
 
 __all__ = [

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct, field
 
-from appliance.model.open_enum import OpenEnum
+from appliance.model.messages import OpenEnum
 
 
 class Tier(OpenEnum):

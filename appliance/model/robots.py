@@ -1,8 +1,18 @@
-"""Robots as their speakers describe them, orders to them, and what came of these."""
+"""Robots as their speakers describe them, orders to them, what came of these, and each number's plausible range.
 
+Each number that is shown or decided by has a range in which it can be true. What is outside is left out, and the rest
+of the message is kept: one broken sensor must not take a robot from the list, and its nonsense must not decide which
+robot is sent. Pure.
+"""
+
+import json
+import math
+from collections.abc import Callable
 from typing import Any
 
+import msgspec
 from msgspec import Struct, field
+from msgspec.structs import replace
 
 from appliance.model.messages import Failure
 
@@ -92,3 +102,157 @@ class RobotReply(Struct, frozen=True, kw_only=True, omit_defaults=True):
     result: dict[str, Any] = field(default_factory=dict[str, Any])
     blobs: dict[str, bytes] = field(default_factory=dict[str, bytes])
     failure: Failure | None = None
+
+
+MAX_METRES = 2.1e7
+"""Half of the Earth's circumference: further away is nothing on it."""
+LOWEST_M, HIGHEST_M = -12_000.0, 100_000.0
+"""Of the deepest sea, and of where the atmosphere ends."""
+MAX_MPS = 1000.0
+MAX_ITEMS = 32_767
+"""Of a mission."""
+MAX_VERBS = 128
+MAX_LIST = 32
+"""Actuators, warnings."""
+MAX_NAME, MAX_TEXT = 64, 500
+_ABSURD = 1e300
+"""In place of numbers that JSON does not have; in no range."""
+
+
+def within(value: float, low: float, high: float) -> bool:
+    """Whether a number is one, and in a range."""
+    return math.isfinite(value) and low <= value <= high
+
+
+def plausible_battery(percent: float) -> bool:
+    """Whether it may be a battery's charge."""
+    return within(percent, 0.0, 100.0)
+
+
+def plausible_place(latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether it is a place on Earth."""
+    return within(latitude_deg, -90.0, 90.0) and within(longitude_deg, -180.0, 180.0)
+
+
+def plausible_altitude(metres: float) -> bool:
+    """Whether a vehicle may be so high above the sea, or above where it started."""
+    return within(metres, LOWEST_M, HIGHEST_M)
+
+
+def plausible_speed(mps: float) -> bool:
+    """Whether a robot may be so fast; backwards is slower than nothing."""
+    return within(mps, -MAX_MPS, MAX_MPS)
+
+
+def plausible_item(number: int) -> bool:
+    """Whether it may be an item of a mission, or how many there are."""
+    return 0 <= number <= MAX_ITEMS
+
+
+def plausible_pose(pose: Pose) -> bool:
+    """Whether a robot may be there; its heading is looked at by itself."""
+    return (
+        within(pose.x, -MAX_METRES, MAX_METRES)
+        and within(pose.y, -MAX_METRES, MAX_METRES)
+        and plausible_altitude(pose.z)
+    )
+
+
+def _heading(degrees: float) -> bool:
+    return within(degrees, -360.0, 360.0)
+
+
+def _texts(most: int, length: int) -> Callable[[tuple[str, ...]], bool]:
+    return lambda given: len(given) <= most and all(len(each) <= length for each in given)
+
+
+def _text(length: int) -> Callable[[str], bool]:
+    return lambda given: len(given) <= length
+
+
+_FIELDS: dict[str, tuple[Callable[[Any], bool], Any]] = {
+    "kind": (_text(MAX_NAME), ""),
+    "gateway": (_text(2 * MAX_NAME), ""),
+    "uses": (_texts(MAX_LIST, MAX_NAME), ()),
+    "verbs": (_texts(MAX_VERBS, MAX_NAME), ()),
+    "pose": (plausible_pose, None),
+    "home": (plausible_pose, None),
+    "battery_percent": (plausible_battery, None),
+    "mode": (_text(MAX_NAME), ""),
+    "holding": (_text(MAX_TEXT), ""),
+    "note": (_text(MAX_TEXT), ""),
+    "speed_mps": (plausible_speed, None),
+    "mission_item": (plausible_item, 0),
+    "mission_items": (plausible_item, 0),
+    "estimator": (_texts(MAX_LIST, MAX_TEXT), ()),
+    "warnings": (_texts(MAX_LIST, MAX_TEXT), ()),
+    "failsafe": (_text(MAX_TEXT), ""),
+    "seized": (_text(MAX_TEXT), ""),
+    "speaker": (_text(MAX_NAME), ""),
+}
+"""What each field may be, and what stands in its place when it is not."""
+_LIMITS: dict[str, float] = {"speed_mps": MAX_MPS, "altitude_m": HIGHEST_M, "payload_kg": 1e6, "range_m": 1e8}
+"""The most that a robot may say it can."""
+
+
+def plausible(info: RobotInfo) -> tuple[RobotInfo, tuple[str, ...]]:
+    """Return a robot's state without what cannot be, and the names of the fields that were left out."""
+    changed: dict[str, Any] = {}
+    dropped: list[str] = []
+    for name, (fits, instead) in _FIELDS.items():
+        value = getattr(info, name)
+        if value is not None and not fits(value):
+            changed[name] = instead
+            dropped.append(name)
+    for name in ("pose", "home"):
+        pose: Pose | None = changed.get(name, getattr(info, name))
+        if pose is not None and not _heading(pose.heading_deg):
+            changed[name] = replace(pose, heading_deg=0.0)
+            dropped.append(f"{name}.heading_deg")
+    if info.limits is not None:
+        limits = _plausible_limits(info.limits, dropped)
+        if limits is not info.limits:
+            changed["limits"] = limits
+    return (replace(info, **changed) if changed else info), tuple(dropped)
+
+
+def _plausible_limits(limits: RobotLimits, dropped: list[str]) -> RobotLimits:
+    wrong: list[str] = []
+    for name, most in _LIMITS.items():
+        value: float | None = getattr(limits, name)
+        if value is not None and not within(value, 0.0, most):
+            wrong.append(name)
+    dropped += [f"limits.{name}" for name in wrong]
+    return replace(limits, **dict.fromkeys(wrong)) if wrong else limits
+
+
+_decoder = msgspec.json.Decoder(RobotInfo)
+
+
+def read_robot(payload: bytes) -> RobotInfo:
+    """Return a robot's state as it was put; msgspec.DecodeError when it is none.
+
+    NaN and infinities are no JSON, yet Python and others write them: they are read as numbers that are in no range, so
+    that the rest of the message counts.
+    """
+    try:
+        return _decoder.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        try:
+            table = json.loads(payload, parse_constant=_constant, parse_float=_number, parse_int=_integer)
+            return msgspec.convert(table, type=RobotInfo)
+        except (ValueError, RecursionError, msgspec.ValidationError):
+            raise msgspec.DecodeError(str(error)) from error
+
+
+def _constant(_: str) -> float:
+    return _ABSURD
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else _ABSURD
+
+
+def _integer(text: str) -> int:
+    return int(text) if len(text) < 19 else 2**62  # further digits cost time, and are in no range either

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from appliance.model.open_enum import OpenEnum
+from appliance.model.messages import OpenEnum
 from appliance.model.plans import Plan
 
 MAX_BY = 120

@@ -1,16 +1,299 @@
-"""The record of a task: its plan, what has become of each subtask, and who served it."""
+"""Tasks from request to record: what is asked, states, choice of containers, runs, revisions of plans, records.
 
-from typing import Any
+A request becomes a record, which holds the plan, what has become of each subtask, and who served it. A run is one
+attempt of a subtask on one gateway, as ordered and as it tells of itself; `Need` is what it asks of a container, and
+`Choice` how one was chosen for it (paper, Algorithm 1). A revision changes the plan after a failure.
+"""
 
-from msgspec import Struct
+from typing import Annotated, Any
 
-from appliance.model.messages import Failure
-from appliance.model.placement import Choice, Phase
+from msgspec import Meta, Struct, field
+
+from appliance.model.messages import Failure, OpenEnum
 from appliance.model.plans import Plan, Subtask
-from appliance.model.requests import PLAIN_PRIORITY
-from appliance.model.revisions import Proposal, Revision
-from appliance.model.states import SubtaskState, TaskState
 from appliance.model.steering import Approval, Decision, Pause, Word
+
+PLAIN_PRIORITY = 5
+"""Priority of what nobody gave one: as much room above it as below."""
+HIGHEST_PRIORITY = 9
+LONGEST_DEADLINE_S = 30 * 86_400.0
+"""Beyond a month a deadline is no deadline; a bound keeps sums of seconds exact."""
+
+
+class TaskRequest(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+    """A person's or robot's wish. `id` makes a repeated submission the same task; `plan` skips planning."""
+
+    instruction: str
+    id: str = ""
+    submitter: str = ""
+    plan: Plan | None = None
+    priority: Annotated[int, Meta(ge=0, le=HIGHEST_PRIORITY)] = PLAIN_PRIORITY
+    """0 (whenever there is room) to 9 (before all others)."""
+    deadline_s: Annotated[float, Meta(ge=0, le=LONGEST_DEADLINE_S)] = 0.0
+    """Seconds from acceptance after which it is of no use any more and ends as failed; 0: none."""
+    group: Annotated[tuple[str, ...], Meta(max_length=64)] = ()
+    """Gateways that alone may serve it, by id; empty: whichever can."""
+    approval: Approval = Approval.NEVER
+    """Whether an operator is to approve its plan before anything runs; the gateway's own setting may ask for more."""
+
+
+class TaskState(OpenEnum):
+    """Life of a task. The last three are final."""
+
+    ACCEPTED = "accepted"
+    """Durable, not yet planned."""
+    PROPOSED = "proposed"
+    """Planned; its plan waits for an operator's approval, and nothing runs."""
+    RUNNING = "running"
+    CANCELLING = "cancelling"
+    """Somebody asked to stop it; runs are being ended."""
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing will follow."""
+        return self in (TaskState.SUCCEEDED, TaskState.FAILED, TaskState.CANCELLED)
+
+
+class SubtaskState(OpenEnum):
+    """Life of a subtask. The last three are final."""
+
+    WAITING = "waiting"
+    """Its predecessors have not all succeeded."""
+    READY = "ready"
+    """Could start now; waits for a place (robot, gateway, retry delay)."""
+    DISPATCHED = "dispatched"
+    """Attempt written to the record and sent to a gateway."""
+    RUNNING = "running"
+    """Its handler has run its first line."""
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing will follow."""
+        return self in (SubtaskState.SUCCEEDED, SubtaskState.FAILED, SubtaskState.CANCELLED)
+
+
+class Phase(OpenEnum):
+    """Which phase of container selection served a subtask (paper, Algorithm 1)."""
+
+    LOCAL_WARM = "local warm"
+    REMOTE_WARM = "remote warm"
+    COLD = "cold"
+
+
+class Way(OpenEnum):
+    """How a container comes to serve a subtask; the cheaper of the last two is taken (algorithms: selection)."""
+
+    HERE = "here"
+    """It is on the gateway that decides, with the state the subtask asks for."""
+    RUN_THERE = "run there"
+    """The subtask goes to the container: input bytes / bandwidth + round trip."""
+    BRING_HERE = "bring here"
+    """State volumes come to a container here: state bytes / bandwidth + serialise + deserialise + start."""
+    NEW = "new"
+    """A cold start."""
+
+
+class Need(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a subtask asks of a container: T = (image, cpu, mem, volumes) of Algorithm 1."""
+
+    image: str
+    cpu: float = 0.5
+    memory_mb: int = 128
+    volumes: tuple[str, ...] = ()
+
+
+class Considered(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One possibility that a selection weighed. `verdict` says in words why it was (not) taken."""
+
+    gateway: str
+    container: str = ""
+    image: str = ""
+    way: Way = Way.HERE
+    score: float = 0.0
+    cost_ms: float = 0.0
+    taken: bool = False
+    verdict: str = ""
+
+
+class Choice(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How a container was selected for an attempt, kept in the task's record for `swiftbot pool why`."""
+
+    phase: Phase
+    way: Way
+    by: str
+    """The gateway that decided."""
+    gateway: str
+    container: str = ""
+    cold_ms: float = 0.0
+    """What a cold start was expected to cost there and then."""
+    considered: tuple[Considered, ...] = ()
+    """The best ones first, at most 12."""
+    why: str = ""
+
+
+class RevisionKind(OpenEnum):
+    """How a plan was changed after a failure, cheapest first."""
+
+    ROBOT = "robot"
+    """Another robot does what one cannot do any more."""
+    SKILL = "skill"
+    """A skill that its manifest names as an alternative takes the place of one that was given up."""
+    PLAN = "plan"
+    """The decomposer has planned anew what was left."""
+
+
+class Dropped(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A subtask that a revision took out of the plan, as it stood then."""
+
+    id: str
+    skill: str
+    robot: str | None = None
+    state: SubtaskState = SubtaskState.WAITING
+    failure: Failure | None = None
+
+
+class Revision(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A change of a task's plan after a failure. Finished subtasks are in every plan of a task."""
+
+    number: int
+    """Counts a task's revisions from 1."""
+    kind: RevisionKind
+    at_ns: int = 0
+    subtask: str = ""
+    """Whose failure led to it."""
+    why: str = ""
+    """What had failed."""
+    note: str = ""
+    """What was done about it, and why nothing simpler was."""
+    plan: Plan | None = None
+    """The plan before; of the latest revisions only."""
+    dropped: tuple[Dropped, ...] = ()
+    added: tuple[str, ...] = ()
+
+
+class Proposal(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A plan that has not taken effect: a task's first one, or what the decomposer proposes after a failure."""
+
+    plan: Plan
+    """The whole plan as proposed; after a failure with ids of its own."""
+    subtask: str = ""
+    """Whose failure led to it; empty: it is the task's first plan."""
+    note: str = ""
+    """Why it waits, or how it came to be."""
+    waits: bool = False
+    """Whether an operator has to approve it first."""
+    hash: str = ""
+    """Of its canonical form: an approval names it (`tasks.steering.hashing`)."""
+    since_s: float = 0.0
+    """The task's `elapsed_s` when it was made: it expires so long after that, whoever coordinates the task then."""
+    expires_s: float = 0.0
+    """How long it waits; 0: not told."""
+    at_ns: int = 0
+
+
+class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Order to run one attempt of a subtask; `inputs` are the results of the subtasks it comes after."""
+
+    task: str
+    subtask: str
+    attempt: int
+    skill: str
+    need: Need
+    robot: str | None = None
+    params: dict[str, Any] = field(default_factory=dict[str, Any])
+    inputs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
+    coordinator: str = ""
+    deadline_s: float = 120.0
+    hops: int = 0
+    """How often it was passed on to a gateway with a warm container; one is the most."""
+    resume: dict[str, Any] | None = None
+    """The last checkpoint of an earlier attempt, from which the handler may go on."""
+    calls: int = 0
+    """How many calls had been made when that was saved: those that follow are numbered from there."""
+    priority: int = PLAIN_PRIORITY
+    """Of its task: orders those who wait for a container."""
+    due_s: float = 0.0
+    """Seconds until its task's deadline when the order was sent; 0: none."""
+    submitter: str = ""
+    """Whose task it is: those who wait for a container are served in fair turns."""
+    group: tuple[str, ...] = ()
+    """Gateways that it may be passed on to, as the task's submitter wished; empty: any. The task's own group is no
+    limit here: its members are asked first, but a container that is ready elsewhere counts for more."""
+    anew: bool = False
+    """Passed on, it may be started in a new container as well: whoever passes it on has no room for one."""
+    moves: int = 0
+    """How often the subtask was moved from one gateway to another before."""
+    expected_s: float = 0.0
+    """How long runs of the skill take by the coordinator's experience; 0 when it has none."""
+    avoid: tuple[str, ...] = ()
+    """Gateways where earlier attempts failed: it is not passed on to them."""
+
+    @property
+    def run_id(self) -> str:
+        """`task/subtask/attempt`, unique in the fleet."""
+        return f"{self.task}/{self.subtask}/{self.attempt}"
+
+
+class RunAccepted(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Answer to a run order: where it runs, and how that was decided."""
+
+    gateway: str
+    container: str
+    phase: Phase
+    why: str = ""
+    choice: Choice | None = None
+
+
+class RunEventKind(OpenEnum):
+    """What a run tells: `started`, any number of the next five, then `succeeded` or `failed`."""
+
+    STARTED = "started"
+    PROGRESS = "progress"
+    LOG = "log"
+    PARTIAL = "partial"
+    CHECKPOINT = "checkpoint"
+    """`result` is data from which a later attempt can go on."""
+    ALIVE = "alive"
+    """A sign of life and nothing more: the handler said so, or waits for an answer of the appliance."""
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+
+
+class RunEvent(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """News of a run, published under the task's key and kept by the executing gateway until the task ends."""
+
+    task: str
+    subtask: str
+    attempt: int
+    kind: RunEventKind
+    gateway: str = ""
+    container: str = ""
+    phase: Phase | None = None
+    progress: float = 0.0
+    note: str = ""
+    result: dict[str, Any] | None = None
+    failure: Failure | None = None
+    choice: Choice | None = None
+    """On the `progress` that tells of a run which was passed on while it waited: why it was."""
+    startup_ms: float | None = None
+    """On `started`: request received to first line of the handler, on the executing gateway's clock."""
+    duration_ms: float | None = None
+    cpu_ms: float | None = None
+    """At the end: CPU time of its process and of those it waited for, user and system."""
+    peak_mb: float | None = None
+    """At the end: most memory its process held at once, what it shares with the waiting container included."""
+    number: int = 0
+    """Counts what the executing gateway has published of this attempt, from 1: a listener sees what it has missed."""
+    at_ns: int = 0
+    """When it was published, by the executing gateway's clock."""
+    calls: int = 0
+    """On `checkpoint`: how many calls the handler had made by then."""
 
 
 class Attempt(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -36,7 +36,7 @@ from msgspec.structs import replace
 
 from appliance.errors import PayloadError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
-from appliance.model.plausible import plausible, read_robot
+from appliance.model.robots import plausible, read_robot
 from appliance.plane.keys import check_name
 from appliance.plane.membership import Facts, FactsAsk, Known, Membership, Namesakes
 from appliance.plane.rpc import Rpc

@@ -38,8 +38,7 @@ from appliance.pool.starter import Starter
 from appliance.pool.state import ALONE, State
 from appliance.pool.turns import Turn, turn_of
 from appliance.pool.verbs import Verbs, unknown_image
-from appliance.skills.catalogue import Catalogue, SkillManifest
-from appliance.skills.outputs import broken_promises
+from appliance.skills.catalogue import Catalogue, SkillManifest, broken_promises
 
 __all__ = ["Call", "Pool"]
 

@@ -35,7 +35,7 @@ from appliance.model import (
     TaskRecord,
     TaskRequest,
 )
-from appliance.model.geo import to_globe
+from appliance.model.site import to_globe
 from appliance.plane.keys import Keys
 from appliance.record.models import Deletion, Gap, Incident, LoggedMessage, RecorderStatus, Trigger, compile_expression
 

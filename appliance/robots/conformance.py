@@ -19,7 +19,7 @@ from msgspec import Struct
 
 from appliance.errors import DeadlineError, RobotError, SwiftbotError, UnreachableError
 from appliance.model import Pose, RobotCommand, RobotInfo, RobotReply, encode
-from appliance.model.plausible import plausible, read_robot
+from appliance.model.robots import plausible, read_robot
 from appliance.plane.session import Session
 from appliance.robots.executor import UNREADABLE
 from appliance.robots.retry import FIRST_SILENCE_S, LONG_POLL_S

@@ -24,7 +24,7 @@ from msgspec.structs import replace
 
 from appliance.errors import SwiftbotError, from_code
 from appliance.model import Box, Pose, RobotCommand, RobotInfo, Site
-from appliance.model.geo import GRAZE_M, MAX_EXTENT_M, blocked_leg, core, crosses, inside, rings
+from appliance.model.site import GRAZE_M, MAX_EXTENT_M, blocked_leg, core, crosses, inside, rings
 from appliance.robots.verbs import (
     MAX_WAYPOINTS,
     GotoArgs,

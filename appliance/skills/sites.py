@@ -14,7 +14,7 @@ import msgspec
 
 from appliance.errors import ConfigError
 from appliance.model import Box, Device, Door, Person, Place, Site, SiteObject
-from appliance.model.geo import inside
+from appliance.model.site import inside
 from appliance.skills.catalogue import SKILLS, convert
 
 SITES = SKILLS / "sites"

@@ -16,14 +16,12 @@ from rich.text import Text
 from textual.binding import Binding
 from textual.widgets import Input
 
-from appliance.client import FleetClient
+from appliance.client import FleetClient, cancel_outcome, unknown_text
 from appliance.errors import ConfigError, PayloadError, RefusedError
 from appliance.model import TaskRecord, TaskState
 from appliance.model.steering import MAX_WHY
 from appliance.pool.api import Evicted, WarmAsk
 from appliance.reasons import why_text
-from appliance.steering import cancel_outcome
-from appliance.stopping import unknown_text
 from appliance.tasks.api import MigrateAsk
 from appliance.tui.formatting import counted, time_of_day
 from appliance.tui.safe import safe

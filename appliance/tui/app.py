@@ -22,12 +22,12 @@ from textual.css.query import NoMatches
 from textual.screen import Screen
 from textual.widgets import Input
 
-from appliance.collector import gentle_collector
 from appliance.errors import ConfigError, SwiftbotError, UnreachableError
 from appliance.llm.stop_words import stop_request
 from appliance.model import Approval, TaskRecord
-from appliance.model.open_enum import enums_open
+from appliance.model.messages import enums_open
 from appliance.plane.settings import PlaneConfig
+from appliance.process import gentle_collector
 from appliance.tui import actions, command_line, themes
 from appliance.tui.actions import PROMPTS, STOP_IN_WORDS, bindings, key_name, keymap, keys_of
 from appliance.tui.base_screen import FleetScreen

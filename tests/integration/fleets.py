@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.llm.settings import LlmConfig
 from appliance.pool.settings import PoolConfig
 from workshop import local_fleet

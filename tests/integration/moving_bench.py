@@ -16,7 +16,7 @@ from fleets import RULES
 from appliance import config as configuration
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig

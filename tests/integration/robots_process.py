@@ -14,7 +14,7 @@ from fleets import PLAIN, fleet_in
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import RobotInfo
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port

@@ -20,8 +20,8 @@ from pymavlink import mavutil
 from appliance import config as configuration
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.connection import FleetState
 from appliance.errors import ConfigError, NotFoundError
-from appliance.fleet_state import FleetState
 from appliance.model import ContainerState, Phase, RobotCommand, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import (
     ContainerState,
     Need,

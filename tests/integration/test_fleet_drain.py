@@ -12,7 +12,7 @@ import pytest
 from fleets import INTERRUPTIBLE, PLAIN
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from workshop import local_fleet

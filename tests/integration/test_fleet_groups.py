@@ -17,7 +17,7 @@ from fleets import RULES
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import (
     Need,
     Plan,

@@ -12,7 +12,7 @@ import pytest
 from fleets import fleet_in
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState, Process
+from appliance.connection import FleetState, Process
 from appliance.model import GatewayStatus
 from workshop import local_fleet
 

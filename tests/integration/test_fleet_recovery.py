@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, RevisionKind, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig

@@ -11,7 +11,7 @@ from fleets import fleet_in
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import Approval, TaskRecord, TaskRequest, TaskState
 from appliance.tasks.api import ExperienceList
 

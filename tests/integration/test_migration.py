@@ -13,8 +13,8 @@ import pytest
 from moving_bench import counting, ended, fleet_of, further_gateway, pretty, until_running
 
 from appliance.client import FleetClient
+from appliance.connection import FleetState
 from appliance.errors import NotFoundError, RefusedError
-from appliance.fleet_state import FleetState
 from appliance.model import Plan, RobotCommand, Subtask, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig, PressureConfig
 from appliance.record.reader import read

@@ -10,8 +10,8 @@ import pytest
 from moving_bench import ended, fleet_of, pretty, until_running
 
 from appliance.client import FleetClient
+from appliance.connection import FleetState
 from appliance.errors import RefusedError
-from appliance.fleet_state import FleetState
 from appliance.model import Plan, RobotCommand, Subtask, SubtaskRecord, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read

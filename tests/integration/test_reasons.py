@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from test_pool_socket import Service
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.settings import ReplanConfig

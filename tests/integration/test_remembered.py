@@ -10,7 +10,7 @@ from fleets import PLAIN, fleet_in
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import RunEvent, TaskRecord, TaskState
 from appliance.tasks.settings import TasksConfig
 

@@ -16,7 +16,7 @@ import pytest
 from fleets import INTERRUPTIBLE
 from robots_process import Process, gateway_process, open_zenoh, swiftbot
 
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import (
     Failure,
     Plan,

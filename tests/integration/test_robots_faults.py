@@ -14,8 +14,8 @@ import msgspec
 import pytest
 from robots_process import BEAT, STATION, beats, gateway_process, open_zenoh, read_frames, swiftbot
 
+from appliance.connection import FleetState
 from appliance.errors import ConflictError, Exit, RefusedError
-from appliance.fleet_state import FleetState
 from appliance.model import Notice, Pose, RobotCommand, RobotInfo, RobotReply, encode
 from appliance.robots.mavlink.dialect import Codec, frame_length, make
 from appliance.robots.settings import RobotsConfig, Template

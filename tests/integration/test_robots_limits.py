@@ -15,8 +15,8 @@ from fleets import RULES
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.connection import FleetState
 from appliance.errors import RefusedError
-from appliance.fleet_state import FleetState
 from appliance.llm.safety.settings import RobotLimits, SafetyConfig
 from appliance.model import RobotCommand, RobotReply, TaskRequest, TaskState, encode
 from appliance.pool.settings import PoolConfig

@@ -10,7 +10,7 @@ import pytest
 from robots_process import STATION, Process, gateway_process, read_frames
 
 from appliance.model import TaskRecord, TaskState
-from appliance.model.geo import to_globe
+from appliance.model.site import to_globe
 from appliance.robots.mavlink.dialect import Codec, make
 from appliance.skills.sites import load_site
 

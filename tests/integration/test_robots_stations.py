@@ -37,7 +37,7 @@ from appliance.model import (
     TaskState,
     encode,
 )
-from appliance.model.geo import to_globe
+from appliance.model.site import to_globe
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store

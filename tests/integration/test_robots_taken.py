@@ -12,7 +12,7 @@ from fleets import PLAIN
 from pymavlink import mavutil
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import RobotInfo, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from workshop import local_fleet

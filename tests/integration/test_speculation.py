@@ -15,7 +15,7 @@ from moving_bench import ended, pretty
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import Notice, Plan, RobotCommand, Subtask, SubtaskState, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 from appliance.record.reader import read

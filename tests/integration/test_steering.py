@@ -13,8 +13,8 @@ from fleets import fleet_in
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
+from appliance.connection import FleetState
 from appliance.errors import ConflictError, PayloadError, PlanError, RefusedError, SwiftbotError
-from appliance.fleet_state import FleetState
 from appliance.model import (
     Act,
     Approval,

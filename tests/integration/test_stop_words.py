@@ -13,8 +13,8 @@ import pytest
 from fleets import fleet_in
 
 from appliance.client import FleetClient
+from appliance.connection import FleetState
 from appliance.errors import Exit, RefusedError
-from appliance.fleet_state import FleetState
 from appliance.model import TaskRecord, TaskRequest, TaskState
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]

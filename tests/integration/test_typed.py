@@ -13,8 +13,8 @@ from fleets import fleet_in
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.connection import FleetState
 from appliance.errors import PlanError, RefusedError
-from appliance.fleet_state import FleetState
 from appliance.model import RobotInfo, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
 

@@ -10,7 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from appliance import cli
-from appliance.cli import planning, steer, submitting
+from appliance.cli import plan, steer, task
+from appliance.client import Named, named
 from appliance.errors import UnreachableError
 from appliance.model import (
     Approval,
@@ -26,7 +27,6 @@ from appliance.model import (
     TaskState,
 )
 from appliance.robots.api import StopAnswer
-from appliance.stopping import Named, named
 from appliance.tasks.api import PlanAnswer, PlanChecked
 
 ROSTER = ("rover_1", "rover_2", "drone_1")
@@ -132,7 +132,7 @@ class Fleet:
 def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
     """Return the fleet that every command connects to."""
     made = Fleet()
-    for module in (steer, submitting, planning):
+    for module in (steer, task, plan):
         monkeypatch.setattr(module, "FleetClient", lambda _: made)
     return made
 
@@ -296,8 +296,8 @@ def test_without_wait_it_is_shown_too(fleet: Fleet, swiftbot: Any) -> None:
 def terminal(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the answers that a person at the terminal will give."""
     answers: list[str] = []
-    monkeypatch.setattr(submitting, "on_terminal", lambda: True)
-    monkeypatch.setattr(submitting.console.out, "input", lambda _, **__: answers.pop(0))
+    monkeypatch.setattr(task, "on_terminal", lambda: True)
+    monkeypatch.setattr(task.console.out, "input", lambda _, **__: answers.pop(0))
     return answers
 
 

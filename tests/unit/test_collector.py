@@ -2,7 +2,7 @@
 
 import gc
 
-from appliance.collector import THRESHOLDS, gentle_collector
+from appliance.process import THRESHOLDS, gentle_collector
 
 
 def test_what_is_there_is_left_alone_and_cycles_still_go() -> None:

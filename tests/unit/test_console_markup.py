@@ -14,10 +14,9 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance import cli, console, reasons
-from appliance.cli import links, records, steer
-from appliance.console import SafeConsole
-from appliance.console_plan import analysis_text, experience_table, provenance_text
-from appliance.console_watch import revision_lines, stream_line
+from appliance.cli import plane, robots, steer
+from appliance.client import Stopped
+from appliance.console import SafeConsole, analysis_text, experience_table, provenance_text, revision_lines, stream_line
 from appliance.errors import RefusedError
 from appliance.llm.analysis import Analysis
 from appliance.model import (
@@ -37,7 +36,6 @@ from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
 from appliance.records import Held
 from appliance.robots.api import LinkList, StopAnswer
-from appliance.stopping import Stopped
 from appliance.tasks.api import ExperienceList, PlanAnswer
 from appliance.tasks.lines import Line
 from appliance.tasks.views import TaskWhy
@@ -90,9 +88,9 @@ SHOWN: dict[str, Callable[[str], Any]] = {
     "evicted": of(dict[str, Evicted], console.evicted_text),
     "images": of(tuple[ImageState, ...], console.image_table),
     "robots": of(tuple[RobotInfo, ...], console.robot_table),
-    "links": of(dict[str, LinkList], links.links_tables),
-    "held records": of(list[Held], records.held_table),
-    "place": lambda text: records.place_table(filled(Record, text), filled(RecordPlace, text), text),
+    "links": of(dict[str, LinkList], robots.links_tables),
+    "held records": of(list[Held], plane.held_table),
+    "place": lambda text: plane.place_table(filled(Record, text), filled(RecordPlace, text), text),
     "stop": of(StopAnswer, lambda answer: Stopped(unknown=("[/red]",), answer=answer).text()),
 }
 

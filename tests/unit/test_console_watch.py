@@ -1,6 +1,6 @@
 """How a stream and revisions look in a terminal."""
 
-from appliance.console_watch import revision_lines, stream_line
+from appliance.console import revision_lines, stream_line
 from appliance.model import Dropped, Plan, Proposal, Revision, RevisionKind, Subtask, SubtaskState, TaskRecord
 from appliance.tasks.lines import Line, LineKind
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from appliance import gateway as daemon
-from appliance import service
+from appliance import process
 from appliance.errors import ConfigError, Exit
 from appliance.plane.membership import displaced
 
@@ -50,7 +50,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
     it = Fake()
     monkeypatch.setattr(daemon, "Gateway", it.made)
     for each in ("ready", "stopping"):
-        monkeypatch.setattr(service, each, lambda: None)
+        monkeypatch.setattr(process, each, lambda: None)
     return it
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Box, Site
-from appliance.model.geo import (
+from appliance.model.site import (
     GRAZE_M,
     bearing_deg,
     blocked_leg,

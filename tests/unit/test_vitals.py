@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance import vitals
+from appliance import process
 
 
 def test_a_reading_counts_for_half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -13,13 +13,13 @@ def test_a_reading_counts_for_half_a_second(monkeypatch: pytest.MonkeyPatch) -> 
         readings.append(interval)
         return float(len(readings))
 
-    monkeypatch.setattr(vitals.psutil, "cpu_percent", cpu_percent)
+    monkeypatch.setattr(process.psutil, "cpu_percent", cpu_percent)
     now = 0.0
-    it = vitals.Vitals(clock=lambda: now)
+    it = process.Vitals(clock=lambda: now)
     first = it.read()
     assert first.memory_mb > 1
     for number in range(100):
         now = number / 20
-        assert now - it.read().at < vitals.KEPT_S
+        assert now - it.read().at < process.KEPT_S
     assert len(readings) == 10
     assert it.read().cpu_percent == 10.0

@@ -5,8 +5,8 @@ from msgspec.structs import replace
 from rich.console import Console, RenderableType
 
 from appliance import console
+from appliance.client import cancel_outcome
 from appliance.model import Failure, Plan, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.steering import cancel_outcome
 from appliance.tasks.views import view, waits_for
 
 LOST = "waits for robot rover_1, lost since 14:03:22 UTC, while it held the red box"

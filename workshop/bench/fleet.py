@@ -12,8 +12,8 @@ from contextlib import asynccontextmanager
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
+from appliance.connection import FleetState
 from appliance.errors import SwiftbotError
-from appliance.fleet_state import FleetState
 from appliance.llm.settings import LlmConfig
 from appliance.model import RunAccepted, RunEvent, RunEventKind, RunRequest
 from appliance.pool.settings import PoolConfig

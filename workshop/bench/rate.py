@@ -22,8 +22,8 @@ import psutil
 from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.connection import FleetState
 from appliance.errors import ConfigError
-from appliance.fleet_state import FleetState
 from appliance.model import GatewayStatus
 from appliance.pool.settings import PoolConfig
 from workshop.bench import fleet

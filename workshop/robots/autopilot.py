@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Generic, TypeVar
 
 from appliance.model import Site
-from appliance.model.geo import to_globe, to_site
+from appliance.model.site import to_globe, to_site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message, make
 from appliance.robots.mavlink.statustext import statustext

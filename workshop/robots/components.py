@@ -8,7 +8,7 @@ limits, angles at a bounded rate, a point to look at. No I/O.
 import math
 from typing import TYPE_CHECKING
 
-from appliance.model.geo import to_site
+from appliance.model.site import to_site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message, constant, make
 

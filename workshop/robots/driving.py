@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from appliance.model import Pose
-from appliance.model.geo import bearing_deg, turn_deg
+from appliance.model.site import bearing_deg, turn_deg
 
 ACCELERATION = 1.5
 TURN_DPS = 120.0

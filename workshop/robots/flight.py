@@ -8,7 +8,7 @@ metres, seconds.
 import math
 from typing import NamedTuple
 
-from appliance.model.geo import bearing_deg, turn_deg
+from appliance.model.site import bearing_deg, turn_deg
 
 ACCELERATION = 2.5
 """m/s²; a brisk multirotor."""

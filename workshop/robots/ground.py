@@ -5,7 +5,7 @@ It has the face of `flight.Flight`, so that one autopilot drives both.
 
 import math
 
-from appliance.model.geo import bearing_deg, turn_deg
+from appliance.model.site import bearing_deg, turn_deg
 from workshop.robots.flight import Point
 
 ACCELERATION = 1.5

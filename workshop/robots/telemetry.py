@@ -3,7 +3,7 @@
 import math
 from typing import TYPE_CHECKING, Any
 
-from appliance.model.geo import to_globe
+from appliance.model.site import to_globe
 from appliance.robots.mavlink.dialect import Message, constant, make
 from appliance.robots.mavlink.vehicle import PREARM_CHECK
 from workshop.robots.safety import arming_problems

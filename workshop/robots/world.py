@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Struct
 
 from appliance.model import Box, Person, Pose, Site
-from appliance.model.geo import bearing_deg, inside
+from appliance.model.site import bearing_deg, inside
 from appliance.robots.verbs import RobotFailure
 
 OPEN, CLOSED, ON, OFF = "open", "closed", "on", "off"

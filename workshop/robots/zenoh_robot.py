@@ -20,7 +20,7 @@ from msgspec import Struct, field
 
 from appliance.errors import ConfigError, ConflictError, UnreachableError
 from appliance.model import Notice, Pose, RobotCommand, RobotInfo, Site, encode
-from appliance.model.geo import blocked_leg
+from appliance.model.site import blocked_leg
 from appliance.plane.keys import check_name
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeGuard
 
 from appliance.model import Box, Place, Site, Subtask
-from appliance.model.geo import off_site
+from appliance.model.site import off_site
 from appliance.skills._lib.coordinates import COORDINATE, read
 from appliance.skills.sites import plain_name
 

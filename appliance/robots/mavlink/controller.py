@@ -17,7 +17,7 @@ from itertools import pairwise
 import structlog
 
 from appliance.model import Pose, Site
-from appliance.model.geo import to_globe, to_site
+from appliance.model.site import to_globe, to_site
 from appliance.robots.executor import Done, Verb
 from appliance.robots.limits import breach, check_velocity
 from appliance.robots.mavlink import dialect

@@ -33,7 +33,7 @@ from msgspec.structs import replace
 
 from appliance.errors import PayloadError, SwiftbotError
 from appliance.model import Place, Plan, Site, Subtask, Tier, encode, oversize
-from appliance.model.geo import MAX_EXTENT_M, inside, off_height, off_site, to_site
+from appliance.model.site import MAX_EXTENT_M, inside, off_height, off_site, to_site
 from appliance.robots.executor import KeyValues
 from appliance.robots.mavlink import dialect, statustext
 from appliance.robots.mavlink.dialect import Frame, Message, constant, label, make

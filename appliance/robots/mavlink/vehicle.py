@@ -36,8 +36,8 @@ from dataclasses import dataclass
 from msgspec import Struct
 
 from appliance.model import Pose, RobotInfo, Site
-from appliance.model.geo import to_site
-from appliance.model.plausible import plausible_altitude, plausible_battery, plausible_item, plausible_place
+from appliance.model.robots import plausible_altitude, plausible_battery, plausible_item, plausible_place
+from appliance.model.site import to_site
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Frame, Message
 from appliance.robots.mavlink.statustext import REFUSAL_SEVERITY, Said, Texts

@@ -15,7 +15,7 @@ from moving_bench import write_skills
 
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.llm.settings import LlmConfig
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import pytest
 from textual.pilot import Pilot
 
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.command_line import Command

@@ -15,7 +15,7 @@ from fleets import INTERRUPTIBLE, fleet_in
 from PIL import Image
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
 

@@ -12,7 +12,7 @@ import pytest
 from moving_bench import counting, until_running
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import Approval, Plan, Subtask, TaskRecord, TaskRequest
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig

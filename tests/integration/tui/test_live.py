@@ -28,7 +28,7 @@ from appliance.model import (
     TaskState,
     encode,
 )
-from appliance.model.open_enum import enums_open
+from appliance.model.messages import enums_open
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig

@@ -11,7 +11,7 @@ import pytest
 from moving_bench import counting
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import (
     ContainerState,
     RobotInfo,

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import TaskRecord, TaskRequest, TaskState
 from appliance.record.reader import read
 from appliance.tui.replay import ReplayView

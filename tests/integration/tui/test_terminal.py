@@ -10,7 +10,7 @@ from fleets import fleet_in
 from terminal import Terminal
 
 from appliance.client import FleetClient
-from appliance.fleet_state import FleetState
+from appliance.connection import FleetState
 from appliance.model import SubtaskState, TaskState
 from appliance.pool.settings import PoolConfig
 

@@ -9,10 +9,7 @@ import msgspec
 import pytest
 
 from appliance.config import GatewayConfig
-from appliance.doctor import Check, run_checks
-from appliance.doctor.checks import local_checks
-from appliance.doctor.containers import podman_checks
-from appliance.doctor.machine import FileFacts
+from appliance.doctor import Check, FileFacts, local_checks, podman_checks, run_checks
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
 from appliance.llm.settings import LlmConfig
 from appliance.plane.session import Session

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import ContainerState, SubtaskState, TaskRecord, TaskState, encode
-from appliance.model.open_enum import enums_open
+from appliance.model.messages import enums_open
 
 RECORD = encode(TaskRecord(id="t", instruction="x"))
 

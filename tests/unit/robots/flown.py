@@ -3,7 +3,7 @@
 import asyncio
 
 from appliance.model import Site
-from appliance.model.geo import to_globe
+from appliance.model.site import to_globe
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.controller import VehicleController
 from appliance.robots.mavlink.dialect import Codec, Frame, Message

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Pose, RobotInfo, Site, encode
-from appliance.model.plausible import MAX_VERBS, plausible, read_robot
+from appliance.model.robots import MAX_VERBS, plausible, read_robot
 from appliance.plane.registry import Roster
 from appliance.plane.session import Message as Put
 from appliance.robots.mavlink.dialect import Codec, Frame, make

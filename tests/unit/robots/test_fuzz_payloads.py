@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import PayloadError
 from appliance.model import RobotInfo, TaskRequest, encode
-from appliance.model.plausible import plausible
+from appliance.model.robots import plausible
 from appliance.plane.registry import Roster
 from appliance.plane.session import Message as Put
 from appliance.robots.task_listener import MAX_BYTES, read_request

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from appliance.errors import PayloadError
 from appliance.llm.checks.schema import validate
 from appliance.model import Box, Place, Plan, Site, TaskRecord, TaskRequest, TaskState
-from appliance.model.geo import to_globe
+from appliance.model.site import to_globe
 from appliance.robots.mavlink.command_server import CommandServer
 from appliance.robots.mavlink.dialect import Codec, Frame, Message, make
 from appliance.robots.mavlink.mission_server import Item, MissionServer, UnfitItem, plan_of

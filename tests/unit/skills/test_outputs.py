@@ -5,8 +5,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.skills.catalogue import Output, SkillManifest, load_catalogue
-from appliance.skills.outputs import SHOWN, broken_promises
+from appliance.skills.catalogue import SHOWN, Output, SkillManifest, broken_promises, load_catalogue
 
 GOOD: dict[str, st.SearchStrategy[Any]] = {
     "string": st.text(max_size=5),

@@ -26,7 +26,7 @@ from appliance.model import (
     TaskRecord,
     encode,
 )
-from appliance.model.planner import PlannerStatus, SlotStatus, TierFigures
+from appliance.model.gateways import PlannerStatus, SlotStatus, TierFigures
 from appliance.pool.api import PoolDecision
 from appliance.record.models import RecorderStatus
 from appliance.tui.app import SwiftbotApp

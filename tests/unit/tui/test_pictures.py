@@ -8,8 +8,8 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.model import PlannerStatus, RunEvent, RunEventKind, SlotStatus, TierFigures
-from appliance.model.placement import Phase
-from appliance.model.planner import CacheFigures, UpstreamStatus
+from appliance.model.gateways import CacheFigures, UpstreamStatus
+from appliance.model.tasks import Phase
 from appliance.pool.api import DecisionList, PoolDecision
 from appliance.record.models import RecorderStatus
 from appliance.tui import formatting, themes

@@ -18,7 +18,7 @@ from appliance.model import (
     TaskState,
     encode,
 )
-from appliance.model.open_enum import enums_open
+from appliance.model.messages import enums_open
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.settings import TuiConfig
 from appliance.tui.subscriptions import Hearing

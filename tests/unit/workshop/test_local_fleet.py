@@ -7,8 +7,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from appliance.connection import Process
 from appliance.errors import ConfigError
-from appliance.fleet_state import Process
 from workshop import local_fleet
 from workshop.local_fleet import Order
 

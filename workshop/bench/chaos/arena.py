@@ -14,8 +14,8 @@ from msgspec.structs import replace
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.config import GatewayConfig
+from appliance.connection import Process
 from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
-from appliance.fleet_state import Process
 from appliance.llm.settings import LlmConfig
 from appliance.pool.settings import PoolConfig
 from appliance.record.settings import RecordConfig

@@ -18,10 +18,10 @@ import uvloop
 from msgspec import Struct
 
 from appliance import logs
-from appliance.collector import gentle_collector
 from appliance.plane.dht import Dht
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
+from appliance.process import gentle_collector
 
 _LOOK_S = 0.02
 

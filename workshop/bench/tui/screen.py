@@ -20,8 +20,8 @@ from msgspec import Struct
 from textual import events
 from textual.drivers.headless_driver import HeadlessDriver
 
-from appliance.collector import gentle_collector
 from appliance.plane.settings import PlaneConfig
+from appliance.process import gentle_collector
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.settings import TuiConfig
 from appliance.tui.subscriptions import FleetView

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Box, Device, Door, Person, Place, Pose, Site, SiteObject
-from appliance.model.geo import inside
+from appliance.model.site import inside
 from appliance.robots.verbs import RobotFailure
 from workshop.robots.world import REACH_M, World, aim, answer
 

@@ -54,8 +54,8 @@ def plan(
     if not text:
         raise ConfigError("there is no instruction", remedy='such as: swiftbot plan "Robot_1: go to goal 2"')
 
+    from appliance.client import roster_of
     from appliance.llm.stop_words import stop_request
-    from appliance.stopping import roster_of
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:
@@ -123,7 +123,7 @@ def experience(
     where: Where = HERE,
 ) -> int:
     """Show how skills have done on robots lately, and which thresholds of the planner that has moved."""
-    from appliance.console_plan import experience_table
+    from appliance.console import experience_table
 
     async def go() -> None:
         async with FleetClient(where.endpoint()) as client:

@@ -1,27 +1,343 @@
-"""The checks themselves: each looks at one prerequisite and, when it is missing, says what to do.
+"""Checks every prerequisite of a gateway on this machine and names the remedy for each that is missing.
 
-They exist because most of what keeps a gateway from working lies outside it: rootless Podman alone needs five
-things that no error message of Podman names together. A check that is not `required` is a limit to know about,
-not a reason to stay down. Nothing is changed on the machine but one container that is started and removed.
+Doors: `run_checks` and `Check`. Most of what keeps a gateway from working lies outside it: rootless Podman alone needs
+five things that no error message of Podman names together. A check that is not `required` is a limit to know about, not
+a reason to stay down. Nothing is changed on the machine but one container that is started and removed: no look but a
+trial, the only proof that runtime, ids and storage go together.
+
+There are two seams that tests replace: `Machine` for what is asked of the machine, and the pool's `Engine` for
+Podman's API socket. So each check is a plain decision over plain facts, and a machine without subordinate ids, with a
+full disk or a foreign owner of its runtime folder is a line in a test and not a machine.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+import locale
+import os
+import pwd
+import secrets
+import shutil
+import socket
+import stat
+import sys
+import time
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from ctypes import CDLL, byref, create_string_buffer
 from pathlib import Path
+from typing import Protocol
 from urllib.parse import urlsplit
 
+import psutil
+from msgspec import Struct
+
 from appliance.config import GatewayConfig
-from appliance.doctor.check import SETUP, Check
-from appliance.doctor.containers import check_podman
-from appliance.doctor.machine import Machine, ThisMachine
 from appliance.errors import SwiftbotError
 from appliance.llm.embedded import folder_of
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.pool.engine import Engine, PodmanEngine
+from appliance.pool.engine import LIMITING, ContainerSpec, Engine, EngineFacts, PodmanEngine
+from appliance.pool.images import build_command, reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
+
+_TIME_ERROR = 5
+"""adjtimex's state of a clock that nothing keeps in time (adjtimex(2))."""
+_TIMEX_BYTES = 256
+"""More than struct timex has on any architecture; all zero asks and changes nothing."""
+
+
+class FileFacts(Struct, frozen=True, kw_only=True):
+    """Who owns a file, its permission bits, whether we may write it; `privileged`: setuid root or capabilities."""
+
+    owner: int
+    mode: int
+    writable: bool
+    privileged: bool = False
+
+
+class Machine(Protocol):
+    """The machine as the checks see it."""
+
+    @property
+    def python(self) -> tuple[int, ...]:
+        """Version of Python."""
+        ...
+
+    @property
+    def uid(self) -> int:
+        """Whose process this is."""
+        ...
+
+    @property
+    def user(self) -> str:
+        """That user's name."""
+        ...
+
+    @property
+    def home(self) -> Path:
+        """That user's home."""
+        ...
+
+    @property
+    def environ(self) -> Mapping[str, str]:
+        """The environment."""
+        ...
+
+    @property
+    def encoding(self) -> str:
+        """Of text to and from the terminal."""
+        ...
+
+    def which(self, program: str) -> str | None:
+        """Return a program's path, None when it is not installed."""
+        ...
+
+    def read(self, path: Path) -> str | None:
+        """Return a text file, None when it cannot be read."""
+        ...
+
+    def stat(self, path: Path) -> FileFacts | None:
+        """Return facts of a file or folder, None when there is none."""
+        ...
+
+    def free_mb(self, path: Path) -> float:
+        """Return the free space where a folder is or would be made."""
+        ...
+
+    def bind_problem(self, host: str, port: int, *, udp: bool) -> str:
+        """Return why a port cannot be taken; empty when it can."""
+        ...
+
+    def listener(self, port: int, *, udp: bool) -> str:
+        """Return the command line of this user's process that has a port; empty when it is not ours to see."""
+        ...
+
+    def now(self) -> float:
+        """Return Unix seconds."""
+        ...
+
+    def clock_synchronised(self) -> bool | None:
+        """Return whether the kernel's clock is kept in time; None when the kernel does not tell."""
+        ...
+
+
+class ThisMachine:
+    """The machine this runs on."""
+
+    def __init__(self) -> None:
+        self.python = tuple(sys.version_info[:3])
+        self.uid = os.getuid()
+        self.environ = os.environ
+        self.encoding = locale.getpreferredencoding(do_setlocale=False)
+        try:
+            entry = pwd.getpwuid(self.uid)
+            self.user, self.home = entry.pw_name, Path(entry.pw_dir)
+        except KeyError:  # an id without a name, as in some containers
+            self.user, self.home = str(self.uid), Path.home()
+
+    def which(self, program: str) -> str | None:
+        """Return a program's path; newuidmap and its like lie where an ordinary PATH does not look."""
+        return shutil.which(program, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/bin:/sbin:/bin")
+
+    def read(self, path: Path) -> str | None:
+        """Return a text file, None when it cannot be read."""
+        try:
+            return path.read_text(errors="replace")
+        except OSError:
+            return None
+
+    def stat(self, path: Path) -> FileFacts | None:
+        """Return facts of a file or folder, None when there is none."""
+        try:
+            found = path.stat()
+        except OSError:
+            return None
+        try:
+            capable = bool(os.getxattr(path, "security.capability"))
+        except OSError:
+            capable = False
+        return FileFacts(
+            owner=found.st_uid,
+            mode=stat.S_IMODE(found.st_mode),
+            writable=os.access(path, os.W_OK),
+            privileged=capable or bool(found.st_mode & stat.S_ISUID and found.st_uid == 0),
+        )
+
+    def free_mb(self, path: Path) -> float:
+        """Return the free space where a folder is or would be made."""
+        while not path.exists() and path != path.parent:
+            path = path.parent
+        return shutil.disk_usage(path).free / 2**20
+
+    def bind_problem(self, host: str, port: int, *, udp: bool) -> str:
+        """Return why a port cannot be taken; empty when it can."""
+        kind = socket.SOCK_DGRAM if udp else socket.SOCK_STREAM
+        try:
+            family, _, _, _, address = socket.getaddrinfo(host, port, type=kind)[0]
+            with socket.socket(family, kind) as probe:
+                if not udp:  # what a server does as well: a closed connection's rest is no hindrance
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+        except OSError as error:
+            return error.strerror or str(error)
+        return ""
+
+    def listener(self, port: int, *, udp: bool) -> str:
+        """Return the command line of this user's process that has a port; empty when it is not ours to see."""
+        kind = "udp" if udp else "tcp"
+        hidden = ""
+        for process in psutil.process_iter():
+            words = ""
+            try:
+                if process.uids().real != self.uid:
+                    continue
+                words = " ".join(process.cmdline())
+                found = process.net_connections(kind=kind)
+            except psutil.AccessDenied:
+                # A hardened service does not show what it has open, even to its own user: its name must do.
+                hidden = hidden or (words if "swiftbot gateway" in words else "")
+                continue
+            except psutil.Error:  # it has ended
+                continue
+            if any(each.laddr and each.laddr.port == port and not each.raddr for each in found):
+                return words
+        return hidden
+
+    def now(self) -> float:
+        """Return Unix seconds."""
+        return time.time()
+
+    def clock_synchronised(self) -> bool | None:
+        """Return whether the kernel's clock is kept in time; None when the kernel does not tell."""
+        try:
+            state = CDLL(None, use_errno=True).adjtimex(byref(create_string_buffer(_TIMEX_BYTES)))
+        except (OSError, AttributeError):
+            return None
+        return None if state < 0 else state != _TIME_ERROR
+
+
+SETUP = "run `make setup`"
+"""The remedy for much."""
+
+
+class Check(Struct, frozen=True, kw_only=True):
+    """One prerequisite: what was found, and what to do when it is not `ok`."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+    required: bool = True
+
+
+def podman_checks(facts: EngineFacts) -> Iterator[Check]:
+    """Yield what follows from Podman's own account."""
+    yield Check(name="podman api", ok=True, detail=f"Podman {facts.version}")
+    yield Check(
+        name="rootless", ok=facts.rootless, detail="yes" if facts.rootless else "Podman runs as root", remedy=SETUP
+    )
+    yield Check(
+        name="storage",
+        ok=facts.storage_driver == "overlay",
+        detail=facts.storage_driver,
+        remedy='driver = "overlay" in ~/.config/containers/storage.conf, then podman system reset (removes images)',
+    )
+    missing = ", ".join(sorted(LIMITING - facts.controllers))
+    yield Check(
+        name="limits",
+        ok=facts.limits_enforced,
+        detail="memory, CPU and process limits of containers hold"
+        if facts.limits_enforced
+        else f"cgroup {facts.cgroup_version}: containers' memory, CPU and processes are not limited"
+        + (f" ({missing} not delegated)" if facts.cgroup_version == "v2" else ""),
+        remedy="boot with cgroup v2; delegate cpu, memory and pids to users (docs/operations.md)",
+        required=False,
+    )
+
+
+async def check_images(engine: Engine, catalogue: Catalogue, config: PoolConfig) -> tuple[list[Check], str]:
+    """Return whether each image of the catalogue is there, and the first one that is."""
+    present = {tag for image in await engine.images() for tag in image.tags}
+    checks: list[Check] = []
+    usable = ""
+    for name, spec in catalogue.images.items():
+        full = reference(spec, config)
+        found = full in present
+        usable = usable or (full if found else "")
+        checks.append(
+            Check(
+                name=f"image {name}",
+                ok=found,
+                detail=full if found else f"{full} is not there",
+                remedy=build_command(spec),
+            )
+        )
+    return checks, usable
+
+
+async def check_container(engine: Engine, image: str, runtime: str) -> Check:
+    """Start a container as the pool does and remove it: the only proof that runtime, ids and storage go together."""
+    name = f"swiftbot-doctor-{secrets.token_hex(4)}"
+    spec = ContainerSpec(
+        name=name,
+        image=image,
+        command=("/bin/true",),
+        labels={"swiftbot.doctor": name},
+        binds={},
+        volumes={},
+        environment={},
+        cpu=1.0,
+        memory_mb=64,
+        pids=32,
+        tmp_mb=4,
+        runtime=runtime,
+    )
+    try:
+        await engine.create(spec)
+        try:
+            await engine.start(name)
+        finally:
+            await engine.remove(name)
+    except SwiftbotError as error:
+        return Check(
+            name="container",
+            ok=False,
+            detail=error.message,
+            remedy=error.remedy
+            or 'cgroups: runtime = "runc" in ~/.config/containers/containers.conf; overlay: see storage',
+        )
+    return Check(name="container", ok=True, detail=f"starts{f' with {runtime}' if runtime else ''}")
+
+
+async def check_podman(make_engine: Callable[[], Engine], catalogue: Catalogue, config: PoolConfig) -> list[Check]:
+    """Ask Podman through its API socket; what cannot be told without it is told as such."""
+    try:
+        engine = make_engine()
+    except SwiftbotError as error:
+        return _podman_silent(error)
+    try:
+        facts = await engine.facts()
+        checks = list(podman_checks(facts))
+        images, usable = await check_images(engine, catalogue, config)
+        checks += images
+        if usable:
+            runtime = config.runtime or ("runc" if facts.cgroup_version == "v1" else "")
+            checks.append(await check_container(engine, usable, runtime))
+    except SwiftbotError as error:
+        return _podman_silent(error)
+    finally:
+        engine.close()
+    return checks
+
+
+def _podman_silent(error: SwiftbotError) -> list[Check]:
+    checks = [Check(name="podman api", ok=False, detail=error.message, remedy=error.remedy or SETUP)]
+    checks += [
+        Check(name=name, ok=False, detail="cannot be told: Podman does not answer", remedy="first see to: podman api")
+        for name in ("storage", "images", "container")
+    ]
+    return checks
+
 
 IDS_NEEDED = 65536
 """Subordinate ids of a user: Debian's images use ids to 65534."""
