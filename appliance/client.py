@@ -22,7 +22,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.connection import FleetConnection
+from appliance.connection import Endpoint, FleetConnection
 from appliance.errors import (
     DeadlineError,
     PayloadError,
@@ -115,6 +115,20 @@ STOP_S = 6.0
 """How long a stop waits to be confirmed: by then it has long been put."""
 SWAP_S = 300.0
 """Loading a large model from a slow disk, and its self-test."""
+
+__all__ = [
+    "Endpoint",
+    "FleetClient",
+    "Named",
+    "SteeringCalls",
+    "Stopped",
+    "answer_text",
+    "cancel_outcome",
+    "named",
+    "read_plan_file",
+    "roster_of",
+    "unknown_text",
+]
 
 
 def cancel_outcome(record: TaskRecord) -> str:

@@ -15,21 +15,7 @@ from appliance.errors import Exit, SwiftbotError
 app = App(
     name="swiftbot", help="SwiftBot gateway: instructions to a robot fleet, run in warm containers.", version="0.1.0"
 )
-for part in (
-    task,
-    plan,
-    task,
-    steer,
-    daemons,
-    pool,
-    robots,
-    robots,
-    robots,
-    log,
-    plane,
-    tools,
-    plugins,
-):
+for part in (task, plan, steer, daemons, pool, robots, log, plane, tools, plugins):
     part.add_to(app)
 
 

@@ -243,11 +243,6 @@ STEP_S = 0.5
 LeaseId = Annotated[str, Parameter(name="--lease", help="Id of the lease, as `robots take` printed it.")]
 
 
-def add_hands_to(app: App) -> None:
-    """Add these commands; they hang below `robots`."""
-    del app
-
-
 @robots_app.command(name="take")
 def robots_take(
     robot: str,
@@ -363,11 +358,6 @@ _WHY = "conformance check"
 _GOTO_S = 30.0
 _SLOW_S = 2.0
 _MARKS = {"passed": "[green]✔[/green]", "failed": "[red]✘[/red]", "skipped": "[yellow]–[/yellow]"}
-
-
-def add_conformance_to(app: App) -> None:
-    """Add this command; it hangs below `robots`."""
-    del app
 
 
 @robots_app.command(name="check")

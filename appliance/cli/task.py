@@ -38,7 +38,7 @@ task_app = App(name="task", help="List, show, watch, move and cancel tasks, and 
 
 def add_to(app: App) -> None:
     """Add these commands."""
-    for command in (submit, fleet, tui):
+    for command in (submit, fleet, tui, drain, undrain):
         app.command(command, group=WORK)
     app.command(task_app)
 
@@ -508,12 +508,6 @@ def _answer(question: str) -> Literal["yes", "no", "edit"]:
 
 
 LOOK_S = 0.5
-
-
-def add_moves_to(app: App) -> None:
-    """Add these commands."""
-    app.command(drain, group=WORK)
-    app.command(undrain, group=WORK)
 
 
 @task_app.command(name="migrate")
