@@ -35,7 +35,7 @@ FILLER_PHRASES = (
     "have answered", "how many there are", "is answered", "no problem at all", "no problem", "no worries",
     "no rush", "without exception", "if you would be so kind", "be so kind", "i would appreciate it if",
     "we would appreciate it if", "excuse me", "would it be possible for you to", "how about you", "as you go",
-    "on my mark", "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to",
+    "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to",
     "do not hesitate to", "i would like", "i'd like", "we would like", "we'd like", "would like you to",
     "could you", "can you", "would you", "will you", "could somebody", "could someone", "can somebody",
     "can someone", "would you mind", "would you please", "if you can", "if you please", "if you would",
@@ -98,6 +98,11 @@ RESULTS = _set(
     "transcript report data clip clips sound audio list round"
 )
 """Nouns for what earlier steps bring: a later step works on them without naming them in the plan."""
+SUBJECTS = _set(
+    "status state position positions location temperature battery level levels damage damages progress smoke leak "
+    "leaks condition number people obstacles anomalies defects faults issues problems"
+)
+"""Nouns for what may be reported without "about"."""
 PRONOUNS = _set("it them they he she him her his its that this these those there here")
 """Words that stand for something said before."""
 THINGS = _set("it that this them these those")

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.accounting import Claim, claims
+from appliance.llm.checks.accounting import Claim, claims, text_said
 from appliance.llm.checks.finding import Facts, Finding, Severity
 from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import NUMBERS, Token
@@ -171,6 +171,9 @@ def _scopes(facts: Facts) -> list[Scope]:
         same = any(_may_do(facts, each, asked, inside, who) for each in facts.plan.subtasks)
         kept = bool(asked) and not broken and not alone and not same
         kept = kept and not any(tokens[index].text in open_ended for index in at)
+        if token.text == "without":
+            # What follows is how an order is to be carried out, which no skill knows.
+            kept = kept and number + 1 < len(tokens) and tokens[number + 1].text in _HALTING
         words = facts.words(at)
         found.append(
             Scope(
@@ -182,6 +185,7 @@ def _scopes(facts: Facts) -> list[Scope]:
     return found
 
 
+_HALTING = frozenset(("stopping", "pausing", "waiting", "halting"))
 _BEFORE_NOUNS = frozenset(("a", "an", "any", "the", "no", "some"))
 
 
@@ -344,6 +348,12 @@ def condition(facts: Facts) -> Iterable[Finding]:
         begins = number == 0 or facts.reading.sentence[number] != facts.reading.sentence[number - 1]
         if begins and token.text in ("should", "were", "had"):
             yield _hold("condition", f'"{token.text}" begins a condition', (token.text,))
+    rest = set(left(facts))
+    for number in sorted(rest):
+        after = tokens[number + 1].text if number + 1 < len(tokens) else ""
+        if tokens[number].text in _ONCE and number + 1 in rest and after in _SOMEBODY:
+            words = facts.words(range(number, _clause_end(tokens, number + 1)))
+            yield _hold("condition", f'the plan does not wait for "{words}"', (words,))
     for number, clause in _conditions(facts)[1]:
         words = facts.words(clause)
         first = facts.reading.tokens[number].text
@@ -352,6 +362,10 @@ def condition(facts: Facts) -> Iterable[Finding]:
             hint="wait for a person's answer instead, such as: wait for the all-clear from Ana, then ..."
             if first != "otherwise" else "",
         )  # fmt: skip
+
+
+_ONCE = frozenset(("when", "once", "after", "before", "until", "till", "while", "as"))
+_SOMEBODY = frozenset(("i", "we", "he", "she", "someone", "somebody"))
 
 
 def exception(facts: Facts) -> Iterable[Finding]:
@@ -450,6 +464,110 @@ def correction(facts: Facts) -> Iterable[Finding]:
 
 def _opens_line(tokens: Sequence[Token], number: int) -> bool:
     return number == 0 or tokens[number - 1].text == "\n"
+
+
+_VAGUE = re.compile(
+    r"\bsome (?:other )?(?:time|day)\b|\bsomeday\b|\bone (?:of these )?days?\b|\bin due (?:course|time)\b|"
+    r"\bon (?:my|our|his|her|their|the) (?:mark|signal|command|cue)\b|\b(?:is|are|was|has been|put) on hold\b|"
+    r"\bcalled off\b|\bcan wait\b|\blike (?:last time|before|always|usual|yesterday|the last one)\b|"
+    r"\bas (?:usual|always|last time)\b|\bthe usual\b|\bthe way (?:we|you|i|they)\b|\bsame as\b|"
+    r"\band so (?:on|forth)\b|"
+    r"\betc\b|\band then some\b|\bor something\b|\btake care of\b|\bfinish the job\b|\bsaid (?:no one|nobody)\b|"
+    r"\b(?:just )?kidding\b|\bnvm\b|\bi (?:guess|suppose|wish)\b|\bbut (?:stay|remain|stand)\b|\bin reverse\b|"
+    r"\b(?:pending|subject to)\b|\bpermitting\b|\bso long as\b|\bin case of\b|"
+    r"\bto be (?:confirmed|decided)\b|\btb[acd]\b",
+    re.IGNORECASE,
+)
+"""Idioms that leave open when, how or whether an order is meant, or take it back; their single words say nothing."""
+_NO_ORDER = re.compile(
+    r"\W*(?:(?:hey|hi|hello|ok|okay|so|and|then|well)\W+)*(?:"
+    r"may (?:i|we)(?! have\b| trouble\b| ask\b)|should (?:i|we)|you (?:should|could|might|must) have|you were|"
+    r"i (?:never|didn't|did not|don't|do not)|"
+    r"(?:when|why|where|who|how) (?:will|would|do|does|did|is|are|was|were|can|could|should|shall|have|has)|"
+    r"(?:have|has|had|did|does|do) (?:you|we|they|he|she|i)(?! mind\b| think\b| fancy\b))\b",
+    re.IGNORECASE,
+)
+"""Beginnings that ask, or tell of what was or might have been."""
+
+
+def vague(facts: Facts) -> Iterable[Finding]:
+    """An order that leaves open when, how or whether it is meant is looked at by a person."""
+    tokens, text = facts.reading.tokens, facts.reading.text
+    spoken = _free_values(facts)
+    quoted = {number for number, token in enumerate(tokens) if token.kind == "quote"}
+    for match in _VAGUE.finditer(text):
+        inside = {n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()}
+        if inside and not inside <= spoken | quoted:
+            yield _hold("alternative", f'"{match.group()}" leaves open what is meant', (match.group(),))
+            return
+    if match := _NO_ORDER.match(text):
+        yield _hold("question", f'"{match.group().strip()}" begins no order', (match.group().strip(),),
+                    hint="say what the robots are to do: rover_1: go to dock 1")  # fmt: skip
+
+
+def told_values(facts: Facts) -> Iterable[Finding]:
+    """What is reported, and to whom, is said as such: trailing words are no subject of a report."""
+    tokens = facts.reading.tokens
+    for subtask in facts.plan.subtasks:
+        for name, leads in (("about", _ABOUT), ("to", _TO)):
+            value = subtask.params.get(name)
+            manifest = facts.manifest(subtask)
+            if not isinstance(value, str) or subtask.id in facts.added or manifest is None or not manifest.reports:
+                continue
+            if value in ("operator", "home") or (facts.site is not None and facts.site.find(value) is not None):
+                continue
+            said = text_said(facts.reading, value, facts.site)
+            if not said:
+                continue
+            lead = min(said) - 1
+            while lead >= 0 and tokens[lead].text in _ARTICLES:
+                lead -= 1
+            article = lead < min(said) - 1
+            before = tokens[lead].text if lead >= 0 else ""
+            first = tokens[min(said)].text
+            asked = lead in facts.account.called[subtask.id]
+            subject = name == "about" and (
+                (article and asked) or bool(set(value.lower().split()) & _SUBJECTS) or first in _WHAT
+            )
+            if before not in leads and not subject:
+                yield _hold("names", f'{subtask.id}: "{value}" is not said to be what is reported', (value,))
+
+
+_ARTICLES = frozenset(("the", "a", "an", "any", "all", "its", "his", "her", "their", "my", "our", "your"))
+_ABOUT = frozenset(("about", "on", "of", "regarding", "concerning"))
+_TO = frozenset(("to", "tell", "inform", "notify", "alert", "warn", "let", "update", "brief"))
+_WHAT = frozenset(("what", "how", "whether", "where", "which", "who", "anything", "everything", "any"))
+_SUBJECTS = (lx.RESULTS - {"data", "list", "round"}) | lx.SUBJECTS
+
+
+def late_waits(facts: Facts) -> Iterable[Finding]:
+    """What is to happen once something has happened comes after the wait for it."""
+    tokens = facts.reading.tokens
+    for wait in facts.plan.subtasks:
+        values = facts.account.values[wait.id]
+        if "event" not in wait.params or not values or min(values) == 0:
+            continue
+        first = min(values)
+        word = tokens[first - 1].text
+        called = facts.account.called[wait.id] - {first - 1}
+        sentence = facts.reading.sentence[first]
+        earlier = [
+            each for each in facts.plan.subtasks
+            if each.id != wait.id and (said := facts.account.called[each.id])
+            and max(said) < first and facts.reading.sentence[max(said)] == sentence
+        ]  # fmt: skip
+        later = any(
+            max(facts.account.evidence[each.id], default=-1) > max(values)
+            and facts.reading.sentence[max(facts.account.evidence[each.id])] == sentence
+            for each in facts.plan.subtasks if each.id != wait.id
+        )  # fmt: skip
+        if called or later or not earlier or word not in ("once", "when", "after", "if", "until", "till"):
+            continue
+        # Behind the order that it governs: "go to dock 1 once the floor is dry".
+        if word in ("until", "till") or wait.id not in facts.before[earlier[-1].id]:
+            text = facts.words(range(first - 1, max(values) + 1))
+            yield _hold("condition", f'the plan does not wait for "{text}" before what depends on it', (text,),
+                        hint="say what comes first, such as: wait for the all-clear from Ana, then ...")  # fmt: skip
 
 
 def question(facts: Facts) -> Iterable[Finding]:
