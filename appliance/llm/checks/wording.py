@@ -529,13 +529,14 @@ def told_values(facts: Facts) -> Iterable[Finding]:
             subject = name == "about" and (
                 (article and asked) or bool(set(value.lower().split()) & _SUBJECTS) or first in _WHAT
             )
-            if before not in leads and not subject:
+            lasting = before == "for" and bool(set(value.lower().split()) & (lx.TIMES | lx.DURATIONS))
+            if lasting or (before not in leads and not subject):
                 yield _hold("names", f'{subtask.id}: "{value}" is not said to be what is reported', (value,))
 
 
 _ARTICLES = frozenset(("the", "a", "an", "any", "all", "its", "his", "her", "their", "my", "our", "your"))
 _ABOUT = frozenset(("about", "on", "of", "regarding", "concerning"))
-_TO = frozenset(("to", "tell", "inform", "notify", "alert", "warn", "let", "update", "brief"))
+_TO = frozenset(("to", "tell", "inform", "notify", "alert", "warn", "let", "update", "brief", "for", "send", "give"))
 _WHAT = frozenset(("what", "how", "whether", "where", "which", "who", "anything", "everything", "any"))
 _SUBJECTS = (lx.RESULTS - {"data", "list", "round"}) | lx.SUBJECTS
 
