@@ -53,7 +53,7 @@ from appliance.model import (
 from appliance.model.steering import MAX_STOPPED, MAX_WHY
 from appliance.plane.dedup import Deduplicator
 from appliance.pool.api import DecisionList, DecisionsAsk, EvictAsk, Evicted, ReleaseAsk, Released, WarmAsk, Warmed
-from appliance.pool.transfer.api import Brought, FetchAsk
+from appliance.pool.transfer.protocol import Brought, FetchAsk
 from appliance.robots.api import (
     LEASE_S,
     DriveAsk,

@@ -33,7 +33,7 @@ from appliance.model import (
 )
 from appliance.pool.api import Evicted, PoolDecision
 from appliance.pool.images import ImageState
-from appliance.pool.transfer.api import Brought
+from appliance.pool.transfer.protocol import Brought
 from appliance.reasons import milliseconds
 from appliance.record.models import LogInfo, kinds_text, problem_of, together
 from appliance.record.player import Played

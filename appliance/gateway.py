@@ -47,11 +47,11 @@ from appliance.model import (
 )
 from appliance.plane.node import Plane
 from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
+from appliance.pool.engine import PodmanStorage
 from appliance.pool.images import reference
 from appliance.pool.pool import Call, Pool
 from appliance.pool.settings import PoolConfig
 from appliance.pool.state import ALONE, State
-from appliance.pool.storage import PodmanStorage
 from appliance.pool.transfer.transfers import Transfers
 from appliance.pool.volumes import Volumes
 from appliance.process import Vitals

@@ -21,7 +21,7 @@ SECTIONS = (
     ("pool", "appliance.pool.settings", "PoolConfig"),
     ("pool.weights", "appliance.pool.settings", "Weights"),
     ("pool.pressure", "appliance.pool.settings", "PressureConfig"),
-    ("pool.transfer", "appliance.pool.transfer.settings", "TransferConfig"),
+    ("pool.transfer", "appliance.pool.settings", "TransferConfig"),
     ("llm", "appliance.llm.settings", "LlmConfig"),
     ("safety", "appliance.llm.safety.settings", "SafetyConfig"),
     ("safety.limits", "appliance.llm.safety.settings", "RobotLimits"),

@@ -1,8 +1,8 @@
-"""Everything this product asks of Podman, in one class: the seam to the outside, faked in unit tests.
+"""Everything this product asks of Podman: the seam to the outside, faked in unit tests.
 
 It exists because podman-py is synchronous, untyped and has sharp edges (each noted where it is avoided). All of
 it is confined here: calls run on a few worker threads, each with a client of its own, and whatever goes wrong
-comes out as one of two errors.
+comes out as one of these errors.
 
     UnreachableError     the API socket is absent or does not answer
     PoolError            Podman answered that it will not
@@ -10,25 +10,38 @@ comes out as one of two errors.
 
 Guarantees: a container is created with `--read-only`, no capability, no new privileges, no network, and files
 it makes in its bind-mounted folder belong to the service user (rootless: root inside is that user outside).
+
+`EngineLink` reconnects: Podman is reached when it can be, known to be away when it cannot, tried again with backoff
+until it is back. Containers that run need no Podman, only starting and removing do; so its absence is told and mended
+in the background, never a reason for the pool to stop.
+
+`PodmanStorage` is Podman's images and volumes as transfers need them: the slow calls, on a client of their own. An
+image of 150 MB takes Podman three seconds to give; on the threads that start containers that would be three seconds
+without starts. All traps found there are of Podman 4.3: `pull` takes no transport but a registry's over the API, `get`
+gives layers uncompressed only as docker-archive, and `load` of an OCI archive needs no layer that is in the storage
+already.
 """
 
 import asyncio
 import json
 import os
 import socket
+import tarfile
 import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, BinaryIO, Protocol, TypeVar, cast
 
 import podman
 import requests
+import structlog
 from msgspec import Struct
 from podman.errors import APIError, ImageNotFound, PodmanError
 
-from appliance.errors import PoolError, PrerequisiteError, UnreachableError
+from appliance.errors import NotFoundError, PoolError, PrerequisiteError, SwiftbotError, UnreachableError
 
 T = TypeVar("T")
 RUNTIME_DIRS = Path("/run/user")
@@ -541,3 +554,294 @@ def create_arguments(spec: ContainerSpec) -> dict[str, Any]:
             "cpu_quota": int(spec.cpu * period),
         }
     return arguments
+
+
+log = structlog.get_logger(__name__)
+
+MAX_RECONNECT_S = 30.0
+WATCH_S = 0.5
+"""Pause between two signs of life that Podman is asked for."""
+ANSWER_S = 1.2
+"""How long it may take for one. Two in a row that do not come make it a problem, so within 3 s."""
+
+
+class EngineLink:
+    """Podman as one pool reaches it.
+
+    Args:
+        make_engine: makes the connection's object; may raise SwiftbotError, and is then tried again.
+        reconnect_s: first pause before another try; doubles up to MAX_RECONNECT_S.
+        on_connected: awaited each time Podman answers (again), before it counts as there.
+        on_problem: called when `problem` has changed.
+    """
+
+    def __init__(
+        self,
+        make_engine: Callable[[], Engine],
+        *,
+        reconnect_s: float,
+        on_connected: Callable[[Engine, EngineFacts], Awaitable[None]],
+        on_problem: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.engine: Engine | None = None
+        self.facts: EngineFacts | None = None
+        self._problem = "not started"
+        self._on_problem = on_problem
+        self._silent = False
+        """Whether the problem is that Podman gives no sign of life."""
+        self._make_engine = make_engine
+        self._on_connected = on_connected
+        self._first_pause_s = self._pause_s = reconnect_s
+        self._try_at = 0.0
+        self._connecting: asyncio.Task[None] | None = None
+
+    @property
+    def problem(self) -> str:
+        """Why Podman cannot be used; empty when it can."""
+        return self._problem
+
+    @problem.setter
+    def problem(self, text: str) -> None:
+        changed, self._problem = text != self._problem, text
+        if changed:
+            self._on_problem()
+
+    async def watch(self) -> None:
+        """Ask Podman for signs of life for ever: one that stands still is a problem before the next start needs it."""
+        missed = 0
+        while True:
+            if not missed:
+                await asyncio.sleep(WATCH_S)
+            engine = self.engine
+            if engine is None:
+                missed = 0
+                await asyncio.sleep(WATCH_S)
+                continue
+            try:
+                await engine.ping(ANSWER_S)
+            except SwiftbotError as error:
+                missed += 1
+                if missed >= 2:
+                    self._silent = True
+                    self.lost(error)
+                    await asyncio.sleep(WATCH_S)
+                continue
+            missed = 0
+            if self._silent:
+                # It answers again: what was put off is tried now.
+                self._silent = False
+                self._try_at, self._pause_s = 0.0, self._first_pause_s
+                self.tend(time.monotonic())
+
+    async def start(self, wait_s: float) -> None:
+        """Connect; what takes longer than `wait_s` goes on in the background."""
+        self._connecting = asyncio.create_task(self._connect(), name="connect to Podman")
+        await asyncio.wait({self._connecting}, timeout=wait_s)
+
+    @property
+    def unfinished(self) -> "list[asyncio.Task[None]]":
+        """The attempt to connect that is in progress."""
+        return [self._connecting] if self._connecting is not None and not self._connecting.done() else []
+
+    def cancel(self) -> None:
+        """Give up connecting."""
+        for task in self.unfinished:
+            task.cancel()
+
+    async def close(self) -> None:
+        """Let go of threads and connections."""
+        engine, self.engine = self.engine, None
+        if engine is not None:
+            engine.hang_up()
+            await asyncio.to_thread(engine.close)
+
+    def there(self) -> tuple[Engine, EngineFacts]:
+        """Return Podman and what it said of itself; PoolError when it was never reached."""
+        if self.engine is None or self.facts is None:
+            raise PoolError(self.problem or "Podman is not connected")
+        return self.engine, self.facts
+
+    def lost(self, error: SwiftbotError) -> None:
+        """Note that Podman did not answer."""
+        if not self.problem:
+            self.problem = str(error)
+            self._pause_s = self._first_pause_s
+            self._try_at = time.monotonic() + self._pause_s
+            log.warning("Podman is away", reason=str(error))
+
+    def tend(self, now: float) -> None:
+        """Try to reconnect when it is time to."""
+        if self.problem and now >= self._try_at and not self.unfinished:
+            self._connecting = asyncio.create_task(self._connect(), name="connect to Podman")
+
+    async def _connect(self) -> None:
+        try:
+            self.engine = self.engine or self._make_engine()
+            self.facts = await self.engine.facts()
+            await self._on_connected(self.engine, self.facts)
+        except SwiftbotError as error:
+            if self.problem != str(error):
+                log.warning("Podman cannot be used", reason=str(error))
+            self.problem = str(error)
+            self._try_at = time.monotonic() + self._pause_s
+            self._pause_s = min(2 * self._pause_s, MAX_RECONNECT_S)
+            return
+        self.problem = ""
+        self._pause_s = self._first_pause_s
+
+
+_MOST_IMAGES = 500
+
+
+class ImageFacts(Struct, frozen=True, kw_only=True):
+    """An image as it is in the storage. `layers` are the SHA-256 of the uncompressed layers, the lowest first."""
+
+    id: str
+    """SHA-256 of its configuration, hexadecimal."""
+    layers: tuple[str, ...]
+    size_bytes: int = 0
+
+
+class FoundVolume(Struct, frozen=True, kw_only=True):
+    """A named volume that is there."""
+
+    name: str
+    folder: Path
+    labels: dict[str, str]
+
+
+class PodmanStorage(PodmanEngine):
+    """Images and volumes of the user's Podman."""
+
+    def __init__(self, url: str = "", *, threads: int = 2, timeout_s: float = 300.0) -> None:
+        super().__init__(url, threads=threads, timeout_s=timeout_s)
+
+    # --- volumes ----------------------------------------------------------------------------------------------
+
+    async def volume(self, name: str) -> FoundVolume:
+        """Return a named volume; NotFoundError when there is none."""
+
+        def work(client: Any) -> FoundVolume:
+            response = client.api.get(f"/volumes/{name}/json")
+            if response.status_code == requests.codes.not_found:
+                raise NotFoundError(f"there is no volume {name}")
+            response.raise_for_status()
+            found = response.json()
+            return FoundVolume(
+                name=str(found["Name"]), folder=Path(found["Mountpoint"]), labels=dict(found.get("Labels") or {})
+            )
+
+        return await self._ask(f"volume {name}", work)
+
+    async def remove_volume(self, name: str) -> None:
+        """Remove a volume that no container uses; no error when it is gone."""
+
+        def work(client: Any) -> None:
+            response = client.api.delete(f"/volumes/{name}")
+            if response.status_code != requests.codes.not_found:
+                response.raise_for_status()
+
+        await self._ask(f"remove volume {name}", work)
+
+    async def volumes(self, labels: Mapping[str, str]) -> list[FoundVolume]:
+        """Return the volumes that have all these labels, by name."""
+
+        def work(client: Any) -> list[FoundVolume]:
+            response = client.api.get("/volumes/json")
+            response.raise_for_status()
+            found = [
+                FoundVolume(name=each["Name"], folder=Path(each["Mountpoint"]), labels=dict(each.get("Labels") or {}))
+                for each in response.json() or ()
+            ]
+            return sorted((each for each in found if labels.items() <= each.labels.items()), key=lambda each: each.name)
+
+        return await self._ask("list volumes", work)
+
+    # --- images -----------------------------------------------------------------------------------------------
+
+    async def image(self, reference: str) -> ImageFacts:
+        """Return what an image is made of; NotFoundError when it is not there."""
+        return await self._ask(f"image {reference}", lambda client: _facts(client, reference))
+
+    async def layers(self) -> frozenset[str]:
+        """Return the SHA-256 of all uncompressed layers of the images in the storage."""
+
+        def work(client: Any) -> frozenset[str]:
+            response = client.api.get("/images/json")
+            response.raise_for_status()
+            found: set[str] = set()
+            for each in response.json()[:_MOST_IMAGES]:
+                try:
+                    found.update(_facts(client, str(each["Id"])).layers)
+                except NotFoundError:
+                    continue  # removed just now
+            return frozenset(found)
+
+        return await self._ask("layers of images", work)
+
+    async def export_image(self, image_id: str, take: Callable[[str, BinaryIO], None]) -> None:
+        """Have Podman give an image; `take` gets each blob's SHA-256 and its bytes, uncompressed, on a thread."""
+
+        def work(client: Any) -> None:
+            response = client.api.get(f"/images/{image_id}/get", params={"format": "docker-archive"}, stream=True)
+            try:
+                if response.status_code == requests.codes.not_found:
+                    raise NotFoundError(f"there is no image {image_id[:12]}")
+                response.raise_for_status()
+                with tarfile.open(fileobj=cast("BinaryIO", response.raw), mode="r|") as tar:
+                    for member in tar:
+                        stem, _, suffix = member.name.partition(".")
+                        if len(stem) == 64 and suffix in ("tar", "json") and member.isreg():
+                            body = tar.extractfile(member)
+                            if body is not None:
+                                take(stem, cast("BinaryIO", body))
+            finally:
+                response.close()
+
+        try:
+            await self._ask(f"export image {image_id[:12]}", work)
+        except tarfile.TarError as error:
+            raise PoolError(f"Podman gave image {image_id[:12]} as no archive: {error}") from error
+
+    async def load_image(self, archive: Callable[[], Iterator[bytes]]) -> None:
+        """Load an OCI archive, made piece by piece; PoolError when Podman will not."""
+
+        def work(client: Any) -> None:
+            response = client.api.post(
+                "/images/load", data=archive(), headers={"content-type": "application/x-tar"}, timeout=600
+            )
+            response.raise_for_status()
+
+        await self._ask("load image", work)
+
+    async def remove_image(self, reference: str) -> None:
+        """Take a name from an image, and remove it when that was the last; no error when it is gone."""
+
+        def work(client: Any) -> None:
+            response = client.api.delete(f"/images/{reference}", params={"force": "false"})
+            if response.status_code != requests.codes.not_found:
+                response.raise_for_status()
+
+        await self._ask(f"remove image {reference}", work)
+
+    async def has_image(self, reference: str) -> bool:
+        """Whether an image is there."""
+        try:
+            await self.image(reference)
+        except (NotFoundError, PrerequisiteError):
+            return False
+        return True
+
+
+def _facts(client: Any, reference: str) -> ImageFacts:
+    response = client.api.get(f"/images/{reference}/json")
+    if response.status_code == requests.codes.not_found:
+        raise NotFoundError(f"there is no image {reference}", remedy="swiftbot images list")
+    response.raise_for_status()
+    found = cast("dict[str, Any]", response.json())
+    layers = cast("list[str]", cast("dict[str, Any]", found.get("RootFS") or {}).get("Layers") or [])
+    return ImageFacts(
+        id=str(found["Id"]).removeprefix("sha256:"),
+        layers=tuple(str(each).removeprefix("sha256:") for each in layers),
+        size_bytes=int(found.get("Size", 0)),
+    )

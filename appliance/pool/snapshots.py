@@ -9,19 +9,50 @@ that copy read-only. The layout of the store:
 
 A tree's digest is that of its paths and bytes. Objects and trees appear under their names only when they are whole,
 and an object whose bytes no longer have its digest is written again, so neither a crash nor a damaged disk is served.
+
+Bytecode is added to what containers mount or are made of (`add_bytecode`), since they cannot write any: without it each
+would compile all that it imports, at each start.
 """
 
 import hashlib
 import os
+import py_compile
 import secrets
 import shutil
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from msgspec import Struct
 
 from appliance.errors import ConfigError
-from appliance.pool.bytecode import add_bytecode
+
+
+def add_bytecode(tree: Path, *, inside: Path | None = None) -> None:
+    """Compile all modules below a folder with this Python; another version's ignores what is written.
+
+    It is used only while it is of the very source beside it, whose hash it holds. A module that does not compile is
+    left alone: whoever imports it is told what is wrong with it.
+
+    Args:
+        tree: the folder.
+        inside: where the folder will be, for tracebacks; None: where it is.
+    """
+    for file in tree.rglob("*.py"):
+        # Spelled out, since a prefix for bytecode in this process's environment is of no use to a container.
+        compiled = file.parent / "__pycache__" / f"{file.stem}.{sys.implementation.cache_tag}.pyc"
+        shown = str(inside / file.relative_to(tree)) if inside else None
+        try:
+            py_compile.compile(
+                str(file),
+                str(compiled),
+                shown,
+                doraise=True,
+                invalidation_mode=py_compile.PycInvalidationMode.CHECKED_HASH,
+            )
+        except py_compile.PyCompileError:
+            continue
+
 
 LEFT_OUT = frozenset({"__pycache__", ".git", ".hg", ".svn"})
 """Names that are no part of a skill wherever they are."""

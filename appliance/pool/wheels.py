@@ -25,7 +25,7 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 from packaging.version import Version
 
 from appliance.errors import ConfigError, PrerequisiteError
-from appliance.pool.bytecode import add_bytecode
+from appliance.pool.snapshots import add_bytecode
 from appliance.skills.catalogue import WHEELHOUSE
 from appliance.skills.requirements import FILE, HASH_SIZES, Requirement
 

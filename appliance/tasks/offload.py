@@ -57,11 +57,11 @@ from appliance.model import (
     Way,
 )
 from appliance.plane.node import Plane
-from appliance.pool.books import WithdrawnError
+from appliance.pool.allocator import WithdrawnError
+from appliance.pool.fair_queue import Turn, turn_of
 from appliance.pool.pool import Pool
 from appliance.pool.selection import MOST_CONSIDERED, Candidate, Decision, Facts
-from appliance.pool.transfer.flow import Link
-from appliance.pool.turns import Turn, turn_of
+from appliance.pool.transfer.protocol import Link
 from appliance.tasks.api import ContainerList, RunAsk, RunStatus
 from appliance.tasks.placement import bytes_by_gateway
 from appliance.tasks.records import MAX_NOTE, clean

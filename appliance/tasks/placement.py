@@ -61,7 +61,7 @@ from appliance.model import (
     encode,
 )
 from appliance.plane.node import Plane
-from appliance.pool.turns import Completions, Turn, Turns
+from appliance.pool.fair_queue import Completions, Turn, Turns
 from appliance.tasks import machine
 from appliance.tasks.settings import TasksConfig
 

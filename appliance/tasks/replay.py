@@ -24,7 +24,7 @@ from msgspec.structs import replace
 
 from appliance.errors import RecordError
 from appliance.model import Failure, SubtaskRecord, TaskRecord
-from appliance.pool.decided import EvictionCase, SelectionCase, evict_again, select_again
+from appliance.pool.decisions import EvictionCase, SelectionCase, evict_again, select_again
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import read
 from appliance.tasks import machine

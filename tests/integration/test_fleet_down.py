@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from pool_bench import write_probe
 
-from appliance.pool.engine import remove_fleet
-from appliance.pool.storage import PodmanStorage
+from appliance.pool.engine import PodmanStorage, remove_fleet
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.timeout(400)]
 

@@ -22,7 +22,7 @@ from appliance.model import ContainerState, RunEvent, RunEventKind
 from appliance.pool import images
 from appliance.pool.engine import remove_fleet
 from appliance.pool.pool import Pool
-from appliance.pool.transfer.settings import TransferConfig
+from appliance.pool.settings import TransferConfig
 from appliance.skills.catalogue import load_catalogue
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(240)]

@@ -6,7 +6,7 @@ import pytest
 from pool_bench import Bench
 
 from appliance.model import RunEventKind
-from appliance.pool.storage import PodmanStorage
+from appliance.pool.engine import PodmanStorage
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(400)]
 

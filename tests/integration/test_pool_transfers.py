@@ -11,7 +11,7 @@ from pool_bench import HANDLER, Bench
 from transfer_bench import podman_service, sides
 
 from appliance.model import Phase, RunEventKind
-from appliance.pool import images, keeper
+from appliance.pool import images, manager
 from appliance.pool.api import EvictAsk
 from appliance.pool.engine import PodmanEngine
 from appliance.pool.settings import PoolConfig, PressureConfig
@@ -64,7 +64,7 @@ async def test_a_warm_run_with_state_asks_nothing_of_podman(
     bench: Bench, folder: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each run finds what the last one left, and the fleet knows of it, without one request to Podman's API."""
-    for module, name in ((keeper, "SWEEP_S"), (keeper, "FIRST_SWEEP_S"), (transfers, "_LOOK_S")):
+    for module, name in ((manager, "SWEEP_S"), (manager, "FIRST_SWEEP_S"), (transfers, "_LOOK_S")):
         monkeypatch.setattr(module, name, 1e9)  # what comes by the clock is nobody's run
     asked: list[str] = []
     real = PodmanEngine._ask

@@ -17,7 +17,7 @@ from pool_bench import HANDLER, Bench, engine_ids
 
 from appliance.errors import RefusedError
 from appliance.model import ContainerState, Need, Phase, RunEvent, RunEventKind
-from appliance.pool import images, keeper
+from appliance.pool import images, manager
 from appliance.pool.api import DecisionsAsk, ReleaseAsk
 from appliance.pool.container import Connection, PooledContainer
 from appliance.pool.engine import PodmanEngine
@@ -84,7 +84,7 @@ async def whys(pool: Pool, what: str) -> list[str]:
 async def test_a_warm_start_is_one_message(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """From selection to the handler's first line: one frame on a kept connection, no Podman, no other thread."""
     for name in ("SWEEP_S", "FIRST_SWEEP_S"):
-        monkeypatch.setattr(keeper, name, 1e9)  # what comes by the clock is nobody's start
+        monkeypatch.setattr(manager, name, 1e9)  # what comes by the clock is nobody's start
     pool = await bench.pool(capacity=1, probe_s=1e9, pressure=PressureConfig(watch=False))
     await bench.ready(pool)
     seen: Counter[str] = Counter()

@@ -13,8 +13,8 @@ from pool_bench import Bench, write_probe
 
 from appliance.model import Need, RunEventKind, RunRequest
 from appliance.pool import images
+from appliance.pool.engine import PodmanStorage
 from appliance.pool.settings import PoolConfig
-from appliance.pool.storage import PodmanStorage
 from appliance.skills.catalogue import load_catalogue
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(560)]

@@ -15,10 +15,10 @@ from transfer_bench import MIB, Side, Sides, fill, moved, podman_service, same, 
 
 from appliance.errors import CancelledByOperatorError, NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.plane.keys import Keys
-from appliance.pool.folders import LABEL_KEPT, podman_name
-from appliance.pool.storage import PodmanStorage
+from appliance.pool.engine import PodmanStorage
 from appliance.pool.transfer.archive import Digests
-from appliance.pool.transfer.offers import Offer
+from appliance.pool.transfer.source import Offer
+from appliance.pool.volume_store import LABEL_KEPT, podman_name
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(300)]
 
@@ -253,7 +253,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from transfer_bench import open_side
 from appliance.errors import RefusedError
-from appliance.pool.transfer.spool import Spool
+from appliance.pool.transfer.target import Spool
 
 async def main():
     folder, fleet, listen, connect = sys.argv[2:]
@@ -409,7 +409,7 @@ async def test_images_that_are_not_what_they_say(fleet: Sides, second: str, monk
             digests.update(data)
             self.offers.add(digests.manifest("blob", digest), draft)
 
-        monkeypatch.setattr("appliance.pool.transfer.giving.Giver._keep_blob", lie)
+        monkeypatch.setattr("appliance.pool.transfer.source.Giver._keep_blob", lie)
         with pytest.raises(PayloadError, match="something else"):
             await other.transfers.bring_image(reference, "g0")
         assert other.transfers.refused["transfer bad blob"] == 1

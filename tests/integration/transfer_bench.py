@@ -14,11 +14,10 @@ from typing import Any
 
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
-from appliance.pool.engine import remove_fleet
-from appliance.pool.folders import podman_name
-from appliance.pool.storage import PodmanStorage
-from appliance.pool.transfer.settings import TransferConfig
+from appliance.pool.engine import PodmanStorage, remove_fleet
+from appliance.pool.settings import TransferConfig
 from appliance.pool.transfer.transfers import Transfers
+from appliance.pool.volume_store import podman_name
 from appliance.pool.volumes import Volumes
 
 MIB = 2**20

@@ -20,11 +20,10 @@ from typing import Any
 from appliance.errors import PrerequisiteError
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
-from appliance.pool.engine import LABEL_FLEET, LABEL_GATEWAY, remove_fleet
-from appliance.pool.folders import podman_name
-from appliance.pool.storage import PodmanStorage
-from appliance.pool.transfer.settings import TransferConfig
+from appliance.pool.engine import LABEL_FLEET, LABEL_GATEWAY, PodmanStorage, remove_fleet
+from appliance.pool.settings import TransferConfig
 from appliance.pool.transfer.transfers import Transfers
+from appliance.pool.volume_store import podman_name
 from appliance.pool.volumes import Volumes
 from appliance.ports import free_port
 

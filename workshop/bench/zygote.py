@@ -20,8 +20,8 @@ import anyio
 from appliance.errors import PoolError
 from appliance.model import RunRequest
 from appliance.pool.container import PooledContainer
-from appliance.pool.conversation import order
 from appliance.pool.engine import EngineFacts, PodmanEngine, remove_fleet
+from appliance.pool.runs import order
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
 from appliance.pool.state import ALONE

@@ -9,10 +9,7 @@ Doors:
 Inside: planner; evictor (the interface) with greedy_dual and least_recent behind it.
 """
 
-from appliance.pool.policies.costs import ColdCosts
-from appliance.pool.policies.evictor import Evictor
-from appliance.pool.policies.facts import Idle, Retire, Start, View
-from appliance.pool.policies.planner import Planner, PlannerState
-from appliance.pool.policies.quarantine import Quarantine
+from appliance.pool.policies.eviction import ColdCosts, Evictor, Idle, Retire, Start, View
+from appliance.pool.policies.planner import Planner, PlannerState, Quarantine
 
 __all__ = ["ColdCosts", "Evictor", "Idle", "Planner", "PlannerState", "Quarantine", "Retire", "Start", "View"]

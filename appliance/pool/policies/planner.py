@@ -1,12 +1,14 @@
 """Decides which containers a gateway starts ahead and which it gives up. Plain code: the clock is passed in.
 
-The keeper of the pool and the simulator use the same planner: they tell it what happens (`arrived`, `ended`,
+The manager of the pool and the simulator use the same planner: they tell it what happens (`arrived`, `ended`,
 `hinted`, `evicted`), show it what there is (`View`), and carry out what it answers (`Start`, `Retire`).
 
 Guarantees, each a property test:
     - What `room` and `tend` order never leaves more containers or memory than the view allows, unless busy ones
       alone take more.
     - An image never falls below its floor, except for a run that waits or when the budget itself has shrunk.
+
+`Quarantine` says which images are not to be started: one that does not start is left alone for a while.
 """
 
 import math
@@ -17,19 +19,68 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.model import PoolHint
-from appliance.pool.policies.costs import ColdCosts
-from appliance.pool.policies.demand import Demand, DemandState
-from appliance.pool.policies.evictor import Evictor
-from appliance.pool.policies.facts import Idle, Retire, Start, View
-from appliance.pool.policies.forecaster import Forecaster, Level, Surety
-from appliance.pool.policies.greedy_dual import GreedyDual
-from appliance.pool.policies.hints import OPERATOR, PlanHints
-from appliance.pool.policies.histogram import Histogram
-from appliance.pool.policies.keeping import KeepFixed, KeepHistogram, Keeping, KeepWorth
-from appliance.pool.policies.learned import Learned, LearnedState
-from appliance.pool.policies.least_recent import LeastRecent
-from appliance.pool.policies.rate import Rate, containers_for
+from appliance.pool.policies.eviction import (
+    ColdCosts,
+    Evictor,
+    GreedyDual,
+    Idle,
+    KeepFixed,
+    KeepHistogram,
+    Keeping,
+    KeepWorth,
+    Learned,
+    LearnedState,
+    LeastRecent,
+    Retire,
+    Start,
+    View,
+)
+from appliance.pool.policies.forecast import (
+    OPERATOR,
+    Demand,
+    DemandState,
+    Forecaster,
+    Histogram,
+    Level,
+    PlanHints,
+    Rate,
+    Surety,
+    containers_for,
+)
 from appliance.pool.settings import PoolConfig
+
+
+class Quarantine:
+    """Images whose containers fail to start are left alone for a while, with the reason. The clock is passed in."""
+
+    def __init__(self, *, after: int, for_s: float) -> None:
+        self._after = after
+        self._for_s = for_s
+        self._failures: Counter[str] = Counter()
+        self._until: dict[str, tuple[float, str]] = {}
+
+    def failed(self, image: str, reason: str, now: float) -> None:
+        """Note a failed start."""
+        self._failures[image] += 1
+        if self._failures[image] >= self._after:
+            self._until[image] = (now + self._for_s, reason)
+
+    def succeeded(self, image: str) -> None:
+        """Note a start that worked."""
+        self._failures.pop(image, None)
+        self._until.pop(image, None)
+
+    def reason(self, image: str, now: float) -> str:
+        """Return why the image is left alone; empty when it is not. After the time one more start is tried."""
+        until, reason = self._until.get(image, (0.0, ""))
+        if not reason or now >= until:
+            return ""
+        return f"{self._failures[image]} starts of image {image} failed in a row, left alone for a while: {reason}"
+
+    def reasons(self, now: float) -> tuple[str, ...]:
+        """Return the reasons of all that are left alone."""
+        return tuple(text for image in sorted(self._until) if (text := self.reason(image, now)))
+
 
 AHEAD = 1.5
 """A start is ordered so many times its usual duration ahead …"""

@@ -18,7 +18,7 @@ from typing import BinaryIO, cast
 from msgspec import Struct
 
 from appliance.errors import PayloadError, RefusedError
-from appliance.pool.transfer.manifest import Manifest, root_digest
+from appliance.pool.transfer.protocol import Manifest, root_digest
 
 _COPY = 2**20
 _HEADERS = 64 * 2**10

@@ -4,14 +4,21 @@ Guarantees:
     - What was there stays whole until what arrived is verified whole; a transfer that breaks changes nothing.
     - A broken transfer goes on where it was when it is asked for again, from the same gateway or another.
     - Transfers, what they hold on the disk and what is on its way are bounded (`TransferConfig`).
+
+Images need no registry: any gateway that has one gives it. The layers that are not here are fetched, an OCI archive is
+built of them, loaded and verified. Layers travel uncompressed by their SHA-256, compressed chunk by chunk on the way,
+so a layer is the same thing on every gateway, and one that is here is never asked for.
 """
 
 import asyncio
 import contextlib
+import hashlib
+import io
 import secrets
+import tarfile
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,9 +36,10 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.plane.node import Plane
+from appliance.pool.engine import PodmanStorage
 from appliance.pool.lineage import Relation, VolumeRecord, relation
-from appliance.pool.storage import PodmanStorage
-from appliance.pool.transfer.api import (
+from appliance.pool.settings import TransferConfig
+from appliance.pool.transfer.protocol import (
     Brought,
     CancelAsk,
     Cancelled,
@@ -39,19 +47,108 @@ from appliance.pool.transfer.api import (
     ImageAsk,
     ImageLayout,
     ImageOffer,
+    Link,
+    Manifest,
     Progress,
     TransferList,
     TransfersAsk,
+    is_digest,
 )
-from appliance.pool.transfer.fetching import ASK_S, Fetcher, Job
-from appliance.pool.transfer.flow import Link
-from appliance.pool.transfer.giving import ANSWER_S, REFERENCE_PREFIX, Giver
-from appliance.pool.transfer.images import archive, check_config, check_layout, content_digest
-from appliance.pool.transfer.manifest import Manifest
-from appliance.pool.transfer.offers import Offers
-from appliance.pool.transfer.settings import TransferConfig
-from appliance.pool.transfer.spool import Arrival, Spool
+from appliance.pool.transfer.source import ANSWER_S, REFERENCE_PREFIX, Giver, Offers
+from appliance.pool.transfer.target import ASK_S, Arrival, Fetcher, Job, Spool
 from appliance.pool.volumes import Volumes
+
+MOST_LAYERS = 128
+MOST_CONFIG = 4 * 2**20
+_COPY = 2**20
+_OCI = "application/vnd.oci.image"
+
+
+def check_layout(layout: ImageLayout, reference: str) -> None:
+    """Check what a gateway says an image is made of; PayloadError when it cannot be."""
+    digests = (layout.image_id, *layout.layers)
+    if layout.reference != reference or len(layout.layers) > MOST_LAYERS or not all(map(is_digest, digests)):
+        raise PayloadError(f"image {reference[:100]} was asked for, and something else announced")
+
+
+def check_config(layout: ImageLayout, config: Path) -> bytes:
+    """Return an image's configuration if it is the one announced, with the layers announced; PayloadError otherwise."""
+    if config.stat().st_size > MOST_CONFIG:
+        raise PayloadError(f"image {layout.reference} has a configuration of {config.stat().st_size:,} bytes")
+    data = config.read_bytes()
+    found: Any = None
+    if hashlib.sha256(data).hexdigest() == layout.image_id:
+        try:
+            found = msgspec.json.decode(data, type=dict[str, Any]).get("rootfs", {}).get("diff_ids")
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, AttributeError):
+            found = None
+    if found != [f"sha256:{each}" for each in layout.layers]:
+        raise PayloadError(f"image {layout.reference} is not made of what was announced")
+    return data
+
+
+def content_digest(path: Path) -> str:
+    """SHA-256 of a file. Blocks."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def oci_archive(
+    layout: ImageLayout, config: bytes, blobs: Mapping[str, Path], sizes: Mapping[str, int]
+) -> Iterator[bytes]:
+    """An OCI archive, piece by piece, with those layers that are in `blobs`. Blocks while it reads them.
+
+    Args:
+        layout: what the image is made of.
+        config: its configuration.
+        blobs: the layers that are not in Podman's storage yet.
+        sizes: of all layers that are known; of one that is in the storage it does not matter.
+    """
+    manifest = msgspec.json.encode(
+        {
+            "schemaVersion": 2,
+            "mediaType": f"{_OCI}.manifest.v1+json",
+            "config": _descriptor(f"{_OCI}.config.v1+json", layout.image_id, len(config)),
+            "layers": [_descriptor(f"{_OCI}.layer.v1.tar", each, sizes.get(each, 0)) for each in layout.layers],
+        }
+    )
+    digest = hashlib.sha256(manifest).hexdigest()
+    named = _descriptor(f"{_OCI}.manifest.v1+json", digest, len(manifest))
+    index = {
+        "schemaVersion": 2,
+        "manifests": [named | {"annotations": {"org.opencontainers.image.ref.name": layout.reference}}],
+    }
+    yield from _member("oci-layout", b'{"imageLayoutVersion":"1.0.0"}')
+    yield from _member("index.json", msgspec.json.encode(index))
+    yield from _member(f"blobs/sha256/{digest}", manifest)
+    yield from _member(f"blobs/sha256/{layout.image_id}", config)
+    for each, path in blobs.items():
+        size = path.stat().st_size
+        yield _header(f"blobs/sha256/{each}", size)
+        with path.open("rb") as file:
+            while data := file.read(_COPY):
+                yield data
+        yield bytes(-size % tarfile.BLOCKSIZE)
+    yield bytes(2 * tarfile.BLOCKSIZE)
+
+
+def _descriptor(media_type: str, digest: str, size: int) -> dict[str, Any]:
+    return {"mediaType": media_type, "digest": f"sha256:{digest}", "size": size}
+
+
+def _header(name: str, size: int) -> bytes:
+    info = tarfile.TarInfo(name)
+    info.size, info.mode = size, 0o644
+    return info.tobuf(tarfile.GNU_FORMAT)
+
+
+def _member(name: str, data: bytes) -> Iterator[bytes]:
+    out = io.BytesIO()
+    out.write(_header(name, len(data)))
+    out.write(data)
+    out.write(bytes(-len(data) % tarfile.BLOCKSIZE))
+    yield out.getvalue()
+
 
 log = structlog.get_logger(__name__)
 
@@ -308,7 +405,7 @@ class Transfers:
         job.state = "applying"
         config = await asyncio.to_thread(check_config, layout, blobs.pop(layout.image_id))
         sizes = {digest: path.stat().st_size for digest, path in blobs.items()}
-        await self._storage.load_image(partial(archive, layout, config, blobs, sizes))
+        await self._storage.load_image(partial(oci_archive, layout, config, blobs, sizes))
         facts = await self._storage.image(layout.reference)
         if facts.id != layout.image_id or facts.layers != layout.layers:
             await self._storage.remove_image(layout.reference)

@@ -8,12 +8,12 @@ import pytest
 
 from appliance.errors import PoolError, RefusedError
 from appliance.model import ContainerInfo, ContainerState, Need
-from appliance.pool.books import FOR_A_RUN, Books, WithdrawnError
+from appliance.pool.allocator import FOR_A_RUN, Allocator, WithdrawnError
 from appliance.pool.container import PooledContainer
-from appliance.pool.glance import glance
+from appliance.pool.fair_queue import Turn
+from appliance.pool.manager import glance
 from appliance.pool.policies import ColdCosts
 from appliance.pool.settings import PoolConfig
-from appliance.pool.turns import Turn
 
 pytestmark = pytest.mark.anyio
 
@@ -32,7 +32,7 @@ async def test_a_long_queue_asks_for_room_once_for_each_need() -> None:
         tried.append(need.image)
         return None
 
-    books = Books(PoolConfig(), begin=begin, on_change=lambda _: None, refused=Counter())
+    books = Allocator(PoolConfig(), begin=begin, on_change=lambda _: None, refused=Counter())
     wanted = [Need(image="base"), Need(image="base"), Need(image="vision"), Need(image="base")]
     waiting = [asyncio.create_task(books.wait(need)) for need in wanted]
     while books.queue < len(wanted):
@@ -51,12 +51,12 @@ async def test_a_long_queue_asks_for_room_once_for_each_need() -> None:
 NEED = Need(image="base")
 
 
-def full_books(queue: int = 32) -> Books:
+def full_books(queue: int = 32) -> Allocator:
     """Return books without a container, and without room for one."""
-    return Books(PoolConfig(queue=queue), begin=lambda _: None, on_change=lambda _: None, refused=Counter())
+    return Allocator(PoolConfig(queue=queue), begin=lambda _: None, on_change=lambda _: None, refused=Counter())
 
 
-async def queued(books: Books, *turns: Turn) -> dict[str, "asyncio.Task[PooledContainer]"]:
+async def queued(books: Allocator, *turns: Turn) -> dict[str, "asyncio.Task[PooledContainer]"]:
     """Have them wait, in this order."""
     waiting = {turn.id: asyncio.create_task(books.wait(NEED, turn)) for turn in turns}
     for _ in range(3):

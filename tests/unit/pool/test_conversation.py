@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from appliance.model import Need, Phase, RunEvent, RunEventKind, RunRequest
 from appliance.pool.container import LOST, Connection, Ending
-from appliance.pool.conversation import MOST_CALLS, Call, Conversation
 from appliance.pool.runner.frames import MAX_FRAME
+from appliance.pool.runs import MOST_CALLS, Call, Conversation
 
 KINDS = ("started", "progress", "log", "alive", "partial", "checkpoint", "call", "result", "error")
 NAMES = (

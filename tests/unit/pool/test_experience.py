@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from appliance.errors import RefusedError
 from appliance.model import encode
-from appliance.pool.experience import KEY, Experience, Keepsake
+from appliance.pool.manager import EXPERIENCE_KEY, Experience, Keepsake
 from appliance.pool.policies import ColdCosts, Planner, PlannerState
-from appliance.pool.policies.forecaster import Level
-from appliance.pool.policies.histogram import Histogram
+from appliance.pool.policies.forecast import Histogram, Level
 from appliance.pool.settings import PoolConfig
 
 pytestmark = pytest.mark.anyio
@@ -96,7 +95,7 @@ async def test_kept_and_recalled() -> None:
     shelf.full = True
     await keepsake.stop()
     assert recalled == [told]
-    assert msgspec.json.decode(shelf.values[KEY], type=Experience) == told
+    assert msgspec.json.decode(shelf.values[EXPERIENCE_KEY], type=Experience) == told
 
 
 @pytest.mark.parametrize(
@@ -105,7 +104,7 @@ async def test_kept_and_recalled() -> None:
 async def test_what_cannot_be_read_is_learned_anew(value: bytes) -> None:
     """Damaged experience is dropped with a warning; the pool starts all the same."""
     recalled: list[Experience] = []
-    keepsake = Keepsake(Shelf(**{KEY: value}), recall=recalled.append, tell=Experience)
+    keepsake = Keepsake(Shelf(**{EXPERIENCE_KEY: value}), recall=recalled.append, tell=Experience)
     await keepsake.start()
     await keepsake.stop()
     assert recalled == []

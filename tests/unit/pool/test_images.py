@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from appliance.errors import NotFoundError, PrerequisiteError
-from appliance.pool import engine, images, sources
+from appliance.pool import engine, images
 from appliance.pool.engine import ContainerSpec, PodmanEngine, create_arguments, socket_path
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import Catalogue, load_catalogue
@@ -54,7 +54,7 @@ deb https://other.example bookworm stable
 def test_deb822_sources() -> None:
     """Of a deb822 file only the distribution's own main suites are taken, with their key."""
     key = "[signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]"
-    assert sources.from_deb822(DEB822, "bookworm") == [
+    assert images.from_deb822(DEB822, "bookworm") == [
         f"deb {key} http://one.example/debian bookworm main",
         f"deb {key} http://one.example/debian bookworm-updates main",
         f"deb {key} http://two.example/debian bookworm main",
@@ -64,7 +64,7 @@ def test_deb822_sources() -> None:
 
 def test_one_line_sources() -> None:
     """The same of a one-line-style file."""
-    assert sources.from_list(ONE_LINE, "bookworm") == [
+    assert images.from_list(ONE_LINE, "bookworm") == [
         "deb http://one.example/debian bookworm main",
         (
             "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg]"
@@ -76,18 +76,18 @@ def test_one_line_sources() -> None:
 def test_a_host_without_sources(tmp_path: Path) -> None:
     """A machine that is no Debian, or has no source of its own release, is told what to do instead."""
     with pytest.raises(PrerequisiteError, match="os-release"):
-        sources.host_sources(tmp_path)
+        images.host_sources(tmp_path)
     (tmp_path / "etc/apt/sources.list.d").mkdir(parents=True)
     (tmp_path / "etc/os-release").write_text('ID=x\nVERSION_ID="1"\n')
     with pytest.raises(PrerequisiteError, match="base_image"):
-        sources.host_sources(tmp_path)
+        images.host_sources(tmp_path)
     (tmp_path / "etc/os-release").write_text('VERSION_CODENAME="trixie"\n')
     (tmp_path / "etc/apt/sources.list").write_text(ONE_LINE)
     with pytest.raises(PrerequisiteError, match="trixie main"):
-        sources.host_sources(tmp_path)
+        images.host_sources(tmp_path)
     (tmp_path / "etc/os-release").write_text("VERSION_CODENAME=bookworm\n")
     (tmp_path / "etc/apt/sources.list.d/debian.sources").write_text(DEB822)
-    assert len(sources.host_sources(tmp_path)[1]) == 6
+    assert len(images.host_sources(tmp_path)[1]) == 6
 
 
 def test_names_depend_on_what_goes_in(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,7 @@ import pytest
 
 from appliance.errors import UnreachableError
 from appliance.pool import engine
-from appliance.pool.engine import Engine, EngineFacts, PodmanEngine
-from appliance.pool.link import EngineLink
+from appliance.pool.engine import Engine, EngineFacts, EngineLink, PodmanEngine
 
 pytestmark = pytest.mark.anyio
 

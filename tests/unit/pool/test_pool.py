@@ -11,8 +11,8 @@ import pytest
 
 from appliance.errors import ConfigError, NotFoundError, PayloadError, PoolError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need, Phase, RunEventKind
-from appliance.pool import link as link_module
-from appliance.pool import running as running_module
+from appliance.pool import engine as link_module
+from appliance.pool import runs as running_module
 from appliance.pool.engine import Exit
 from appliance.pool.runner.zygote import MAX_CONNECTIONS
 from appliance.pool.selection import Candidate

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.pool.turns import AGING_S, Completions, Turn, Turns
+from appliance.pool.fair_queue import AGING_S, Completions, Turn, Turns
 
 NAMES = st.sampled_from(("ann", "bob", "cas", ""))
 

@@ -11,12 +11,11 @@ from appliance.errors import ConflictError, NotFoundError, RefusedError, Unreach
 from appliance.model import VersionVector, VolumeInfo
 from appliance.plane.records import Record, increment
 from appliance.plane.store import Store
-from appliance.pool.folders import LABEL_KEPT
-from appliance.pool.storage import FoundVolume, PodmanStorage
+from appliance.pool.engine import FoundVolume, PodmanStorage
+from appliance.pool.settings import TransferConfig
 from appliance.pool.transfer.archive import pack
-from appliance.pool.transfer.manifest import Manifest
-from appliance.pool.transfer.settings import TransferConfig
-from appliance.pool.transfer.swap import Place
+from appliance.pool.transfer.protocol import Manifest
+from appliance.pool.volume_store import LABEL_KEPT, Place
 from appliance.pool.volumes import Volumes
 
 pytestmark = pytest.mark.anyio

@@ -5,9 +5,9 @@ import asyncio
 from collections.abc import Callable, Mapping
 
 from appliance.model import Need, Phase, RunEvent, RunEventKind, RunRequest
-from appliance.pool.books import WithdrawnError
+from appliance.pool.allocator import WithdrawnError
+from appliance.pool.fair_queue import Turn
 from appliance.pool.selection import Decision
-from appliance.pool.turns import Turn
 from tests.unit.tasks.sample_records import event
 
 

@@ -26,7 +26,7 @@ from appliance.model import (
     VolumeInfo,
 )
 from appliance.plane.keys import Keys
-from appliance.pool.decided import EvictionCase, selection_case, watched
+from appliance.pool.decisions import EvictionCase, selection_case, watched
 from appliance.pool.policies import Idle
 from appliance.pool.selection import Candidate, Facts, select
 from appliance.pool.settings import PoolConfig

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from appliance.errors import ConfigError, SwiftbotError
 from appliance.model import Enquiry, SoftStop
 from appliance.pool.api import Evicted, Released, Warmed
-from appliance.pool.transfer.api import Brought
+from appliance.pool.transfer.protocol import Brought
 from appliance.robots.api import StopAnswer
 from appliance.tasks.api import DrainState, Migrated
 from appliance.tasks.views import TaskWhy

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.cli import app
 from appliance.pool.api import Evicted, Released, Warmed
-from appliance.pool.transfer.api import Brought
+from appliance.pool.transfer.protocol import Brought
 from appliance.robots.api import StopAnswer
 from appliance.tasks.api import DrainState, Migrated
 from appliance.tui import command_line

@@ -8,12 +8,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import PoolHint
-from appliance.pool.policies.demand import LONGEST_S, MAX_IMAGES, Demand, until_level_s
-from appliance.pool.policies.forecaster import Level
-from appliance.pool.policies.hints import MAX_HINTS, OPERATOR, PlanHints
-from appliance.pool.policies.histogram import Histogram
-from appliance.pool.policies.idle_times import BUCKETS, IdleTimes, bucket, lower_s
-from appliance.pool.policies.rate import Rate, containers_for
+from appliance.pool.policies.forecast import (
+    BUCKETS,
+    LONGEST_S,
+    MAX_HINTS,
+    MAX_IMAGES,
+    OPERATOR,
+    Demand,
+    Histogram,
+    IdleTimes,
+    Level,
+    PlanHints,
+    Rate,
+    bucket,
+    containers_for,
+    lower_s,
+    until_level_s,
+)
 
 
 def level(number: int = 1, *, busy: int = 0, image: str = "base") -> Level:

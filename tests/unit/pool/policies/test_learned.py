@@ -4,10 +4,8 @@ import random
 
 import pytest
 
-from appliance.pool.policies.demand import Demand
-from appliance.pool.policies.facts import Idle
-from appliance.pool.policies.greedy_dual import GreedyDual
-from appliance.pool.policies.learned import ENOUGH, MAX_PENDING, Learned
+from appliance.pool.policies.eviction import ENOUGH_USES, MAX_PENDING, GreedyDual, Idle, Learned
+from appliance.pool.policies.forecast import Demand
 
 
 def container(image: str, since: float, *, memory_mb: int = 256, runs: int = 1) -> Idle:
@@ -118,4 +116,4 @@ def test_its_memory_is_bounded() -> None:
         policy.evicted(idle[0], number + 1.0)
     assert len(policy._pending) <= MAX_PENDING
     assert len(policy._duels) <= MAX_PENDING
-    assert policy.state().seen >= ENOUGH
+    assert policy.state().seen >= ENOUGH_USES

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from appliance.model import PoolHint
 from appliance.pool.policies import ColdCosts, Idle, Planner, View
-from appliance.pool.policies.greedy_dual import GreedyDual
-from appliance.pool.policies.hints import OPERATOR
+from appliance.pool.policies.eviction import GreedyDual
+from appliance.pool.policies.forecast import OPERATOR
 from appliance.pool.policies.planner import PlannerState, missing, victims
 from appliance.pool.settings import PoolConfig
 

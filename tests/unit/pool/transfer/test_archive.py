@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.pool.transfer.archive import check_link, fingerprint, pack, unpack
-from appliance.pool.transfer.manifest import Manifest
+from appliance.pool.transfer.protocol import Manifest
 
 CHUNK = 16 * 1024
 

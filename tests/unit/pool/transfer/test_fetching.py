@@ -22,14 +22,12 @@ from appliance.errors import (
 )
 from appliance.plane.keys import Keys
 from appliance.plane.node import Plane
-from appliance.pool.transfer import spool as spool_module
-from appliance.pool.transfer.api import ManifestOffer
+from appliance.pool.settings import TransferConfig
+from appliance.pool.transfer import target as spool_module
 from appliance.pool.transfer.archive import Digests
-from appliance.pool.transfer.fetching import Fetcher, Job
-from appliance.pool.transfer.manifest import Manifest
-from appliance.pool.transfer.offers import Offer, Offers, opened
-from appliance.pool.transfer.settings import TransferConfig
-from appliance.pool.transfer.spool import Arrival, Spool
+from appliance.pool.transfer.protocol import Manifest, ManifestOffer
+from appliance.pool.transfer.source import Offer, Offers, opened
+from appliance.pool.transfer.target import Arrival, Fetcher, Job, Spool
 
 pytestmark = pytest.mark.anyio
 

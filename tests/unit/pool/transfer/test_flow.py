@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
-from appliance.pool.transfer.flow import FAILURES, TRUST, Link, Next, Window, after_failure, learned
+from appliance.pool.transfer.protocol import FAILURES, TRUST, Link, Next, Window, after_failure, updated_link
 
 CHUNK = 2**20
 
@@ -56,14 +56,14 @@ def test_cost_is_finite_and_grows_with_size(size: int, samples: list[tuple[int, 
     """MigCost is never negative or infinite and grows with the bytes, whatever was measured."""
     link = Link()
     for bytes_, took_s in samples:
-        link = learned(link, size_bytes=bytes_, move_s=took_s, pack_s=took_s, unpack_s=took_s)
+        link = updated_link(link, size_bytes=bytes_, move_s=took_s, pack_s=took_s, unpack_s=took_s)
     assert 0 <= link.cost_ms(size) < math.inf
     assert link.cost_ms(size) <= link.cost_ms(size + 1)
 
 
 def test_cost_by_hand() -> None:
     """100 MB over 100 MB/s, packed at 500 and unpacked at 250 MB/s, cost 1,000 + 200 + 400 ms."""
-    link = learned(Link(), size_bytes=100_000_000, move_s=1.0, pack_s=0.2, unpack_s=0.4)
+    link = updated_link(Link(), size_bytes=100_000_000, move_s=1.0, pack_s=0.2, unpack_s=0.4)
     assert round(link.cost_ms(100_000_000)) == 1600
 
 

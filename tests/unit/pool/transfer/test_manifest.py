@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import PayloadError, RefusedError
 from appliance.pool.transfer.archive import Digests
-from appliance.pool.transfer.manifest import Manifest, check, missing, reusable, root_digest
+from appliance.pool.transfer.protocol import Manifest, check_manifest, missing, reusable, root_digest
 
 CHUNK = 16 * 1024
 
@@ -31,7 +31,7 @@ def test_manifest_names_every_chunk(size: int, pieces: int) -> None:
     for start in range(0, size, step):
         digests.update(data[start : start + step])
     manifest = digests.manifest("volume", "v")
-    check(manifest, kind="volume", name="v", most_bytes=size)
+    check_manifest(manifest, kind="volume", name="v", most_bytes=size)
     assert sum(manifest.span(index)[1] for index in range(manifest.count)) == size
     for index in range(manifest.count):
         offset, length = manifest.span(index)
@@ -61,7 +61,7 @@ def test_hostile_manifests_are_refused(changes: dict[str, Any], error: type[Exce
     """Sizes, counts, digests and versions that cannot be are refused before anything is done with them."""
     manifest = msgspec.structs.replace(made(bytes(3 * CHUNK)), **changes)
     with pytest.raises(error):
-        check(manifest, kind="volume", name="v", most_bytes=10 * CHUNK)
+        check_manifest(manifest, kind="volume", name="v", most_bytes=10 * CHUNK)
 
 
 def test_size_is_part_of_the_digest() -> None:

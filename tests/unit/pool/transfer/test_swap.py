@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.pool.transfer.swap import Place
+from appliance.pool.volume_store import Place
 
 NAMES = st.sets(st.sampled_from(["a", "b", "c", "d", "e"]))
 

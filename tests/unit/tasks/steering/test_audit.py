@@ -6,7 +6,7 @@ import pytest
 
 from appliance.errors import ConflictError, PayloadError
 from appliance.model import Act, TaskRecord, TaskRequest, encode
-from appliance.pool.transfer.api import FetchAsk
+from appliance.pool.transfer.protocol import FetchAsk
 from appliance.robots.api import StopAsk
 from appliance.tasks.api import ActsAsk, PauseAsk, RetryAsk
 from appliance.tasks.audit import KEPT, Audit, target_of

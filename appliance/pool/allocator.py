@@ -1,8 +1,8 @@
-"""The books of the pool: which containers there are, who has which, and who waits for one.
+"""The allocator: which containers there are, which run holds each, and which runs wait for one.
 
-It exists apart from the keeper because these few rules must hold at every step between two awaits: a container has
-one holder, a hold that is not used ends, and those who wait are served in their order (`turns`). Nothing here starts
-or ends a container, and nothing here is awaited but one's turn.
+It exists apart from the manager because these few rules must hold at every step between two awaits: a container has
+one holder, a hold that is not used ends, and runs that wait are served in their order (`fair_queue`). Nothing here
+starts or ends a container, and nothing here is awaited but one's turn.
 """
 
 import asyncio
@@ -18,9 +18,9 @@ from msgspec.structs import replace
 from appliance.errors import PoolError, RefusedError, SwiftbotError
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool.container import PooledContainer
+from appliance.pool.fair_queue import Turn, Turns
 from appliance.pool.selection import best_local
 from appliance.pool.settings import PoolConfig
-from appliance.pool.turns import Turn, Turns
 
 FOR_A_RUN = "cold"
 """Reservation of a container that is started for one waiting run."""
@@ -47,7 +47,7 @@ class _Waiter:
         self.got: asyncio.Future[PooledContainer] = asyncio.get_running_loop().create_future()
 
 
-class Books:
+class Allocator:
     """Who has which container.
 
     Args:

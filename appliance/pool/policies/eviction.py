@@ -1,36 +1,191 @@
-"""The learned eviction policy: predicts when each idle container is used next, gives up what is worth least.
+"""Eviction: what an idle container is worth, which goes first when room is short, and how long one is kept otherwise.
 
-A linear model of the logarithm of the time to the next use, fitted online by recursive least squares with forgetting
-(Haykin, Adaptive Filter Theory, ch. 9). What a container is worth is the cold start it saves, over the memory it
-holds times the time until then: cold_ms / (memory_mb * predicted seconds). The features: how often and how lately
-its image was asked for, for how long its level (demand.py) was idle and usually is, its start cost and memory, the
-hour of the day, and what plans have announced.
+The facts the policies are told and the orders they answer, each with its reason, are here too (`Idle`, `View`; `Start`,
+`Retire`), and what a cold start of an image costs on this gateway (`ColdCosts`).
 
-It does not trust itself: until it has seen enough uses, and whenever it has lately lost more than it has won
+LeastRecent: what has not been used for longest goes first.
+
+GreedyDual, Greedy-Dual-Size-Frequency: what is used often, dear to start and small stays; what was once popular ages
+away. Cherkasova 1998; for containers Fuerst and Sharma, "FaasCache", ASPLOS 2021, section 4. The priority of an idle
+container is clock + frequency * cold cost / memory, where clock is the priority of the last one given up, read
+when the container was last used. A container of 256 MB that takes 500 ms to start and has served 4 runs since the
+clock stood at 3 is worth 3 + 5 * 500 / 256 = 12.8.
+
+Learned: predicts when each idle container is used next, gives up what is worth least. A linear model of the logarithm
+of the time to the next use, fitted online by recursive least squares with forgetting (Haykin, Adaptive Filter Theory,
+ch. 9). What a container is worth is the cold start it saves, over the memory it holds times the time until then:
+cold_ms / (memory_mb * predicted seconds). The features: how often and how lately its image was asked for, for how long
+its level (`forecast`) was idle and usually is, its start cost and memory, the hour of the day, and what plans have
+announced. It does not trust itself: until it has seen enough uses, and whenever it has lately lost more than it has won
 against Greedy-Dual-Size-Frequency, the latter decides. Win and loss are counted over the evictions on which the two
-differ: whoever would have given up what was asked for first has lost.
+differ: the policy that would have given up what was asked for first has lost.
+
+Keeping: how long an idle container is kept when there is room enough and there is no forecast for it.
 """
 
 import math
 import operator
 import random
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol, TypeAlias
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
-from appliance.pool.policies.demand import LONGEST_S, Demand, until_level_s
-from appliance.pool.policies.facts import Idle
-from appliance.pool.policies.greedy_dual import GreedyDual
+from appliance.pool.policies.forecast import LONGEST_S, Demand, Histogram, Level, until_level_s
+
+
+class Idle(Struct, frozen=True, kw_only=True):
+    """A ready container that nobody has. `since` is when it became so, seconds of the clock that is passed in."""
+
+    id: str
+    image: str
+    memory_mb: int
+    runs: int
+    cold_ms: float
+    since: float
+
+
+class View(Struct, frozen=True, kw_only=True):
+    """The containers of one gateway at one moment, and what they may take."""
+
+    idle: tuple[Idle, ...] = ()
+    busy: dict[str, int] = field(default_factory=dict[str, int])
+    """Containers of each image that have a run or are reserved for one."""
+    lasting: dict[str, int] = field(default_factory=dict[str, int])
+    """Of these, how many have been so for longer than a start of their image takes."""
+    starting: dict[str, int] = field(default_factory=dict[str, int])
+    memory_mb: int = 0
+    """Memory of all containers in whatever state."""
+    containers: int = 0
+    """All containers in whatever state."""
+    budget_mb: int
+    """What they may take together now: less than the setting while the machine is short of memory."""
+    capacity: int
+    blocked: frozenset[str] = frozenset()
+    """Images that are not to be started now (quarantine)."""
+
+
+class Start(Struct, frozen=True, kw_only=True):
+    """Start a container of this image, because."""
+
+    image: str
+    why: str
+
+
+class Retire(Struct, frozen=True, kw_only=True):
+    """Give this container up, because."""
+
+    id: str
+    why: str
+
+
+class ColdCosts:
+    """ColdCost(T): the moving 75th percentile of this gateway's own cold starts of each image, milliseconds."""
+
+    def __init__(self, initial_ms: float, *, window: int = 16) -> None:
+        self._initial_ms = initial_ms
+        self._window = window
+        self._seen: dict[str, deque[float]] = {}
+        self._costs: dict[str, float] = {}
+        self._usual_ms = initial_ms
+
+    def add(self, image: str, took_ms: float) -> None:
+        """Note a cold start."""
+        seen = self._seen.setdefault(image, deque(maxlen=self._window))
+        seen.append(took_ms)
+        self._costs[image] = sorted(seen)[(3 * len(seen)) // 4]
+        self._usual_ms = sum(self._costs.values()) / len(self._costs)
+
+    def of(self, image: str) -> float:
+        """Return what a cold start of this image is expected to cost."""
+        return self._costs.get(image, self._initial_ms)
+
+    def usual_ms(self) -> float:
+        """Return the mean over the images that were started here; the initial guess before any was."""
+        return self._usual_ms
+
+    def state(self) -> dict[str, tuple[float, ...]]:
+        """Return what was measured, to be kept."""
+        return {image: tuple(seen) for image, seen in self._seen.items()}
+
+    def restore(self, state: Mapping[str, tuple[float, ...]]) -> None:
+        """Go on from what was measured before."""
+        for image, seen in state.items():
+            for took_ms in seen:
+                self.add(image, took_ms)
+
+
+class Evictor(Protocol):
+    """Says what idle containers are worth; the planner gives up the one worth least.
+
+    Worths are compared with each other only, within one call; they have no unit in common between policies.
+    """
+
+    def arrived(self, image: str, now: float) -> None:
+        """Note that a run asked for this image here."""
+        ...
+
+    def worths(self, idle: Sequence[Idle], now: float) -> list[float]:
+        """Return what each of these containers is worth, in their order; one without id is yet to be started."""
+        ...
+
+    def evicted(self, idle: Idle, now: float) -> None:
+        """Note that it was given up for want of room."""
+        ...
+
+
+class LeastRecent:
+    """LRU, the baseline: looks neither at size nor at cost nor at how often."""
+
+    def arrived(self, image: str, now: float) -> None:
+        """Nothing: the time of the last use is in the container."""
+
+    def worths(self, idle: Sequence[Idle], now: float) -> list[float]:
+        """Return the times of last use, seconds."""
+        del now
+        return [each.since for each in idle]
+
+    def evicted(self, idle: Idle, now: float) -> None:
+        """Nothing to remember."""
+
+
+class GreedyDual:
+    """The floor that every other eviction policy has to beat. State: one number a container."""
+
+    def __init__(self) -> None:
+        self._clock = 0.0
+        self._marks: dict[str, tuple[float, float]] = {}
+
+    def arrived(self, image: str, now: float) -> None:
+        """Nothing: each container counts its own runs."""
+
+    def worths(self, idle: Sequence[Idle], now: float) -> list[float]:
+        """Return the priorities, milliseconds a megabyte."""
+        del now
+        marks: dict[str, tuple[float, float]] = {}
+        for each in idle:
+            mark = self._marks.get(each.id)
+            # Used since it was last seen: the clock of its last use is the clock now, for it only moves at evictions.
+            marks[each.id] = mark if mark is not None and mark[0] == each.since else (each.since, self._clock)
+        self._marks = marks
+        return [marks[each.id][1] + (each.runs + 1) * each.cold_ms / each.memory_mb for each in idle]
+
+    def evicted(self, idle: Idle, now: float) -> None:
+        """Set the clock to the priority of the one given up."""
+        del now
+        mark = self._marks.pop(idle.id, None)
+        if mark is not None:
+            self._clock = max(self._clock, mark[1] + (idle.runs + 1) * idle.cold_ms / idle.memory_mb)
+
 
 Vector: TypeAlias = NDArray[np.float64]
 
 FEATURES = 11
 FORGET = 0.9995
-ENOUGH = 64
+ENOUGH_USES = 64
 """Uses it must have seen before it decides."""
 MAX_PENDING = 256
 SAMPLES = 4
@@ -108,7 +263,7 @@ class Learned:
     @property
     def decides(self) -> bool:
         """Whether it decides itself; otherwise Greedy-Dual does."""
-        return self._seen >= ENOUGH and self._balance >= LEAST_BALANCE
+        return self._seen >= ENOUGH_USES and self._balance >= LEAST_BALANCE
 
     def state(self) -> LearnedState:
         """Return what it has learned."""
@@ -255,3 +410,71 @@ class Learned:
             elif now - duel.at < HORIZON_S:
                 kept.append(duel)
         self._duels = kept
+
+
+class Keeping(Protocol):
+    """Says when an idle container has been kept for long enough."""
+
+    def rests(self, idle: Idle, level: Level, now: float) -> str:
+        """Return why it is kept no longer; empty while it is kept. `level` is the one it would serve."""
+        ...
+
+
+class KeepFixed:
+    """Keep-alive of a fixed time, as OpenWhisk and the paper's local pool do (there 10 minutes)."""
+
+    def __init__(self, idle_s: float) -> None:
+        self._idle_s = idle_s
+
+    def rests(self, idle: Idle, level: Level, now: float) -> str:
+        """Give up what was idle for longer."""
+        del level
+        return "idle for long" if now - idle.since > self._idle_s else ""
+
+
+class KeepHistogram:
+    """As long as the idle times of its level say; the fixed time where they say nothing."""
+
+    def __init__(self, histogram: Histogram, otherwise: Keeping) -> None:
+        self._histogram = histogram
+        self._otherwise = otherwise
+
+    def rests(self, idle: Idle, level: Level, now: float) -> str:
+        """Give up what is outside its window."""
+        why = self._histogram.rests(level, idle.since, now)
+        return self._otherwise.rests(idle, level, now) if why is None else why
+
+
+class KeepWorth:
+    """For as long as it is worth its memory: a small one that is dear to start waits longer than a large cheap one.
+
+    One of usual size (pool.container_memory_mb) and usual start cost (the mean here) is kept while it is expected to be
+    used within `idle_s`; one of twice the memory within half of it. Where the learned policy does not trust its
+    predictions, the fixed time counts. A level whose idle times say that it is not due for a while rests.
+    """
+
+    def __init__(
+        self,
+        learned: Learned,
+        histogram: Histogram | None,
+        costs: ColdCosts,
+        *,
+        usual_mb: int,
+        idle_s: float,
+    ) -> None:
+        self._learned = learned
+        self._histogram = histogram
+        self._costs = costs
+        self._usual_mb_s = usual_mb * idle_s
+        self._otherwise = KeepFixed(idle_s)
+
+    def rests(self, idle: Idle, level: Level, now: float) -> str:
+        """Give up what is worth less than its memory."""
+        if self._histogram is not None and (why := self._histogram.rests(level, idle.since, now)):
+            return why
+        wait_s = self._learned.wait_s(idle, level.number, now)
+        if wait_s is None:
+            return self._otherwise.rests(idle, level, now)
+        if idle.cold_ms * self._usual_mb_s >= self._costs.usual_ms() * idle.memory_mb * wait_s:
+            return ""
+        return f"not expected to be used for {wait_s:.0f} s"

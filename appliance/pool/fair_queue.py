@@ -1,4 +1,4 @@
-"""Whose turn it is among those who wait: by priority, then the earliest deadline, then fairly between submitters.
+"""Fair queueing: who is next among those who wait, by priority, then the earliest deadline, then fairly by submitter.
 
 It exists apart from what is waited for (a container, or room in a fleet) and from the waiting itself, as plain code
 with the clock passed in (but for `turn_of`), so that its promises can be property-tested:
@@ -6,8 +6,8 @@ with the clock passed in (but for `turn_of`), so that its promises can be proper
     - A higher priority goes first; within one priority the earlier deadline, those without one last.
     - Among those left, submitters take turns by start-time fair queueing (Goyal, Vin and Cheng, 1996): each has a
       virtual time that grows by the cost of what it was served, and the one furthest behind is next. So a flood
-      from one submitter delays another by no more than what is being served, however long the flood is. Whoever
-      comes anew begins at the present virtual time: not having asked before earns nothing.
+      from one submitter delays another by no more than what is being served, however long the flood is. A new
+      submitter begins at the present virtual time: not having asked before earns nothing.
     - Waiting raises the priority by one every `aging_s`, without a limit: whatever waits is passed by only finitely
       many that come after it, so nothing starves.
 """
