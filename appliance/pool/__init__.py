@@ -2,18 +2,18 @@
 
 Doors:
     pool.Pool            select, run, cancel, drain: what the task manager uses
-    verbs.Verbs          warm, evict, release, hint, decisions: what operators and other gateways ask (`api`)
+    pool.Verbs           warm, evict, release, hint, decisions: what operators and other gateways ask (`api`)
     selection            Algorithm 1 as plain functions; Candidate, Decision
+    decisions            what was decided and why; traces for the log, and the same code deciding them again
+    fair_queue           who is next among those who wait; the task manager queues by it too
     images               build and list the images that skills run in (`wheels`: their Python packages)
-    volumes, transfer    state volumes and images that move between gateways
+    volumes, transfer    state volumes and images that move between gateways (`lineage`: which state is newer)
     engine.remove_fleet  remove a fleet's containers, and if asked its volumes, from this machine
-    simulator.simulate   what the policies make of hours of arrivals, without a container
     settings.PoolConfig  section `[pool]` of a gateway's file
 
-Inside, from above to below: pool (the door), running (runs in progress), conversation (one run), keeper (tending:
-starts ahead, probes, replaces, gives up), planning (what the policies are shown, and what they mean here), books (who
-has which, who waits), policies (what to keep, give up and start), pressure (memory), starts (starts in progress,
-quarantine), starter (what a container is), snapshots (the code that it mounts), container (its connections), link and
-engine (Podman), runner (what runs within). Of state volumes: volumes (whose state is the newest), ledger (which is
-here), folders (its files).
+Inside, from above to below: pool (the door), runs (runs in progress), manager (containers started ahead, probed,
+replaced, given up), allocator (which run has which container, which wait), policies (what to keep, give up and start),
+pressure (memory), starter (what a container is), state (what it asks of volumes), snapshots (the code that it mounts),
+container (its connections), engine (Podman), runner (what runs within). Of state volumes: volumes (whose state is the
+newest), volume_store (which is here, and its files).
 """

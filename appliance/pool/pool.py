@@ -234,7 +234,7 @@ class Pool:
         on_change: told the facts of all containers whenever one of them changes.
         state: where state volumes and images of other gateways come from.
         store: keeps what the pool learns over a restart; None: it begins anew each time.
-        on_decided: told each selection and eviction with what it rested on (`decided`), if the settings say so.
+        on_decided: told each selection and eviction with what it rested on (`decisions`), if the settings say so.
         make_engine: Podman, unless a test says otherwise.
         read_memory: what the kernel says of memory, unless a test says otherwise.
 

@@ -2,5 +2,7 @@
 
 Doors:
     transfers.Transfers       bring a volume or an image here; serve ours to others; what it costs
-    settings.TransferConfig   table `transfer` of section `[pool]`
+
+Inside: protocol (what is moved and asked for, how fast; pure), source (gives), target (fetches), archive (a volume as a
+tar file). Settings: `TransferConfig` of `pool.settings`.
 """
