@@ -12,8 +12,7 @@ import msgspec
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, PayloadError
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig
+from appliance.llm.settings import LlmConfig, SafetyConfig
 from appliance.plane.keys import check_name
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig

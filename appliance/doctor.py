@@ -31,7 +31,7 @@ from msgspec import Struct
 
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
-from appliance.llm.embedded import folder_of
+from appliance.llm.settings import folder_of
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import LIMITING, ContainerSpec, Engine, EngineFacts, PodmanEngine

@@ -29,7 +29,7 @@ from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, PrerequisiteError
 from appliance.llm.api import SwapAsk, Swapped
 from appliance.llm.cascade import Decomposer
-from appliance.llm.checks.policy import strictest
+from appliance.llm.checks.safety import strictest
 from appliance.llm.peers import PeerTier, ProposeAsk, Proposed
 from appliance.llm.settings import PlanContext
 from appliance.model import (

@@ -10,7 +10,7 @@ import msgspec
 import structlog
 
 from appliance.errors import RefusedError, SwiftbotError
-from appliance.llm.safety.settings import SafetyConfig
+from appliance.llm.settings import SafetyConfig
 from appliance.model import TaskRecord, TaskRequest
 from appliance.plane.node import Plane
 from appliance.robots.task_listener import Tasks

@@ -17,8 +17,7 @@ from msgspec.structs import replace
 
 from appliance.errors import ConfigError, NotFoundError, PlanError, RecordError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.stop_words import stop_request
 from appliance.model import Plan, RobotInfo, Site, Verdict
 from appliance.skills.catalogue import Catalogue

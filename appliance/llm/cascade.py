@@ -2,49 +2,132 @@
 
 Why it exists: a small local model is quick and private but weaker, an upstream one is better but may be slow, away or
 not allowed, and rules always answer for plain orders. What was planned before and carried out with success comes first
-of all (`routing.cache`). Every plan, that one too, passes the same validator and the safety policy. A model whose plan
-is not valid is asked once more with the problems; then, or when it is not sure enough, too slow, or broken, the next
-tier is asked. What each made of it goes with the plan (`Provenance`), so that a person sees why it came from where it
-did.
+of all (`plan_cache`). Every plan, that one too, passes the same validator and the safety policy. A model whose plan is
+not valid is asked once more with the problems; then, or when it is not sure enough, too slow, or broken, the next tier
+is asked. What each made of it goes with the plan (`Provenance`), so that a person sees why it came from where it did.
+`Figures` counts what was asked and what came of it, for the status of the gateway.
 """
 
 import asyncio
 import contextlib
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from statistics import median
 from typing import TYPE_CHECKING
 
 import msgspec
 import structlog
+from msgspec import Struct, field
 
 from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError, SwiftbotError
-from appliance.llm.analysis import Analysis, analyse
+from appliance.llm import analysis
+from appliance.llm.analysis import Analysis
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.completion import completed
-from appliance.llm.experience.memory import Memory
-from appliance.llm.figures import Figures
-from appliance.llm.intake import explained, no_plan, refused, stop_refused
+from appliance.llm.feedback import Memory
 from appliance.llm.peers import ProposeAsk, Proposed
+from appliance.llm.plan_cache import catalogue_digest, digest, plan_key
+from appliance.llm.preprocessing import explained, no_plan, refused, stop_refused, told
 from appliance.llm.review import Facts, Review, reasons, review
-from appliance.llm.rewriting import told
-from appliance.llm.routing.budget import Budget
-from appliance.llm.routing.canonical import catalogue_digest, digest, plan_key
-from appliance.llm.routing.gate import Gate
-from appliance.llm.routing.privacy import Privacy
-from appliance.llm.routing.thresholds import Thresholds
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome
-from appliance.llm.so_far import so_far
+from appliance.llm.routing import Budget, Gate, Privacy, Thresholds
+from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome, SafetyConfig, so_far
 from appliance.llm.stop_words import stop_request
 from appliance.llm.tier import Planner, Proposal
 from appliance.llm.tiers import Slot, configured
-from appliance.model import Finding, Plan, PlannerStatus, Provenance, Severity, TaskRecord, Tier, TierAttempt, plan_hash
+from appliance.model import (
+    Finding,
+    Plan,
+    PlannerStatus,
+    Provenance,
+    Severity,
+    SlotStatus,
+    TaskRecord,
+    Tier,
+    TierAttempt,
+    TierFigures,
+    UpstreamStatus,
+    plan_hash,
+)
 from appliance.skills.catalogue import Catalogue
+
+_LATEST = 64
+
+
+def _latencies() -> deque[float]:
+    return deque(maxlen=_LATEST)
+
+
+class Counted(Struct):
+    """Of one tier."""
+
+    asked: int = 0
+    failed: int = 0
+    ms: deque[float] = field(default_factory=_latencies)
+
+
+class Figures:
+    """Since the start."""
+
+    def __init__(self) -> None:
+        self.tiers: dict[str, Counted] = {}
+        self.withheld = 0
+        """Instructions that were not sent upstream for privacy."""
+        self._planned = 0
+        self._escalated = 0
+
+    def asked(self, tier: str) -> None:
+        """Count a question to a tier."""
+        self.tiers.setdefault(tier, Counted()).asked += 1
+
+    def failed(self, tier: str) -> None:
+        """Count a tier's answer that was not taken."""
+        self.tiers.setdefault(tier, Counted()).failed += 1
+
+    def took(self, tier: str, ms: float) -> None:
+        """Note how long a tier took."""
+        self.tiers.setdefault(tier, Counted()).ms.append(ms)
+
+    def planned(self, tier: Tier, attempts: Sequence[TierAttempt]) -> None:
+        """Count a plan; it was escalated when another tier was asked before."""
+        self._planned += 1
+        asked = [each.tier for each in attempts if not any(text.startswith("not asked") for text in each.problems)]
+        self._escalated += bool(asked) and asked[0] != tier.value
+
+    def status(self, slots: Sequence[Slot], memory: Memory, gate: Gate) -> PlannerStatus:
+        """Return it all."""
+        told: list[object] = [getattr(slot.planner, "status", None) for slot in slots]
+        upstream = next((each for each in told if isinstance(each, UpstreamStatus)), None)
+        return PlannerStatus(
+            tiers={
+                tier: TierFigures(
+                    asked=each.asked, failed=each.failed, p50_ms=round(median(each.ms), 3) if each.ms else 0.0
+                )
+                for tier, each in self.tiers.items()
+            },
+            slot=next((each for each in told if isinstance(each, SlotStatus)), None),
+            cache=memory.cache.figures,
+            upstream=None
+            if upstream is None
+            else UpstreamStatus(
+                state=upstream.state,
+                retry_after_s=upstream.retry_after_s,
+                requests=upstream.requests,
+                spent=upstream.spent,
+                budget=upstream.budget,
+                withheld=self.withheld,
+            ),
+            waiting=gate.waiting,
+            refused=gate.refused,
+            planned=self._planned,
+            escalated=self._escalated,
+            thresholds=memory.thresholds.all,
+        )
+
 
 if TYPE_CHECKING:
     from appliance.llm.api import Swapped
 
-__all__ = ["Decomposer", "Slot"]
 
 log = structlog.get_logger(__name__)
 
@@ -166,7 +249,7 @@ class Decomposer:
                 the model before goes on.
             RefusedError: another swap is under way.
         """
-        from appliance.llm.swapping import swap  # noqa: PLC0415 - a gateway that swaps nothing does not pay for it
+        from appliance.llm.local import swap  # noqa: PLC0415 - a gateway that swaps nothing does not pay for it
 
         if self._changing.locked():
             raise RefusedError("another model is being loaded already", remedy="wait until that is done")
@@ -260,10 +343,10 @@ class Decomposer:
         """Review a plan that a person or a robot wrote: as any, but the words only give notes."""
         return review(Facts(plan, context, self._catalogue, self._safety, require_implemented=True, edited=True))
 
-    def analyse(self, context: PlanContext, plan: Plan) -> Analysis:
+    def analysis(self, context: PlanContext, plan: Plan) -> Analysis:
         """Return what an instruction asks for, with its plan and by what is known of the skills and robots."""
         known = self.memory.experience
-        return analyse(
+        return analysis(
             context.instruction,
             plan,
             self._catalogue,

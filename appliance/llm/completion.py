@@ -8,15 +8,13 @@ import re
 
 from msgspec.structs import replace
 
-from appliance.llm.checks.accounting import text_said
-from appliance.llm.checks.finding import Facts
+from appliance.llm.checks.facts import Facts, text_said
 from appliance.llm.checks.places import locate
-from appliance.llm.checks.policy import robots_of
 from appliance.llm.checks.robots import candidates
+from appliance.llm.checks.safety import robots_of
 from appliance.llm.checks.schema import is_unnamed
 from appliance.llm.checks.things import away, sent_elsewhere
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import PlanContext
+from appliance.llm.settings import PlanContext, SafetyConfig
 from appliance.model import Plan, Subtask
 from appliance.skills.catalogue import Catalogue
 

@@ -12,7 +12,7 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import DeadlineError, PlanError, SwiftbotError, UnreachableError
-from appliance.llm.routing.breaker import Breaker
+from appliance.llm.routing import Breaker
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
 from appliance.model import GatewayStatus, Plan, RobotInfo, Tier

@@ -13,13 +13,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.llm.checks import consistency, robots, things, wording
-from appliance.llm.checks.contradiction import contradictions
-from appliance.llm.checks.finding import Facts
-from appliance.llm.checks.grounding import ungrounded
-from appliance.llm.checks.policy import policy_holds, unsafe
+from appliance.llm.checks.consistency import contradictions
+from appliance.llm.checks.facts import Facts
+from appliance.llm.checks.safety import policy_holds, ungrounded, unsafe
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import PlanContext
+from appliance.llm.settings import PlanContext, SafetyConfig
 from appliance.model import SPLIT, Finding, Plan, Severity, Verdict
 from appliance.skills.catalogue import Catalogue
 

@@ -1,19 +1,144 @@
-"""Configuration of the planner, and the words its callers use with it.
+"""Configuration of the planner and of plans' safety, and the types its callers use with it.
 
-They stand apart from the cascade so that whoever only passes them on (the RPC verbs, the terminal UI, the
-configuration file) imports nothing that plans.
+`LlmConfig` is the configuration's `llm`, `SafetyConfig` its `safety`; `folder_of` finds the model that
+`llm.local_model` names, `embedded` being the one that comes with the program. `PlanContext` is a request: an
+instruction with the roster, the site and, when the rest of a plan is to be planned anew, what has become of the earlier
+plan (`SoFar`). `PlanOutcome` is the answer.
+
+They stand apart from the cascade so that whoever only passes them on (the RPC verbs, the terminal UI, the configuration
+file, the model's own process) imports nothing that plans.
 """
 
 import re
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from appliance.errors import ConfigError
-from appliance.llm.so_far import SoFar
-from appliance.model import Plan, RobotInfo, Site, TierAttempt
+from appliance.model import Plan, RobotInfo, Site, SubtaskState, TaskRecord, TierAttempt
 
-__all__ = ["KNOWN_TIERS", "LlmConfig", "PlanContext", "PlanOutcome", "TierAttempt"]
+EMBEDDED = "embedded"
+EMBEDDED_FOLDER = Path(__file__).with_name("planner")
+
+
+def folder_of(model: str) -> str:
+    """Return the folder of a model as the configuration names it: `embedded`, a path, or "" for none."""
+    return str(EMBEDDED_FOLDER) if model == EMBEDDED else str(Path(model).expanduser()) if model else ""
+
+
+def remedy_of(folder: str) -> str:
+    """Return what to do about a folder that is no model's."""
+    if Path(folder) == EMBEDDED_FOLDER:
+        return 'this installation lacks its planner: install it again, or set llm.local_model to "" for none'
+    return 'set llm.local_model to "embedded", to an onnxruntime-genai folder, or to "" for none'
+
+
+Pattern = Annotated[str, Meta(min_length=1, max_length=100)]
+
+
+class RobotLimits(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What certain robots may not do. All that match a robot hold for it, the strictest of each kind."""
+
+    robots: tuple[Pattern, ...]
+    """Shell patterns of robot ids, such as `drone_*`."""
+    altitude_m: Annotated[float, Meta(ge=0)] | None = None
+    """A plan that says more, or names a place that lies higher, is refused; a skill's usual take-off is lowered."""
+    speed_mps: Annotated[float, Meta(gt=0)] | None = None
+    """A plan that says more is refused; what a skill or robot would choose is lowered when the order is sent."""
+    duration_s: Annotated[float, Meta(gt=0)] | None = None
+    """A plan that says more is refused, and one that says none where the skill's usual time is above it or unknown."""
+    skills_never: tuple[Pattern, ...] = ()
+    """Shell patterns of skills."""
+    places_never: tuple[Pattern, ...] = ()
+    """Shell patterns of place names, lower case."""
+
+
+class SafetyConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The safety policy: it can only tighten what roster, catalogue and site allow, of handed-in plans too."""
+
+    skills_never: tuple[Pattern, ...] = ()
+    """Shell patterns of skills that no plan may have."""
+    places_never: tuple[Pattern, ...] = ()
+    """Shell patterns of names (lower case) of places, areas and objects that no plan may send a robot to, beside the
+    site's forbidden areas."""
+    exclusive_places: tuple[Pattern, ...] = ()
+    """Shell patterns of place names where only one robot may be at a time: a plan has to order their visits."""
+    limits: tuple[RobotLimits, ...] = ()
+    """Of single robots. An unnamed robot is held to the strictest that could be chosen."""
+    robot_tasks: Literal["any", "own", "never"] = "any"
+    """Whom a task that a robot asks for may command: `any` robot, only itself (`own`), or nobody (`never`)."""
+    grounded: bool = True
+    """Refuse a model's plan that names a robot, place, object or text of which the instruction says nothing: neither
+    invention nor what was slipped into names and notes of robots becomes a subtask."""
+    choose_robot: Literal["ask", "auto"] = "ask"
+    """What becomes of an order that names no robot where several can do it: `ask` holds the plan until an operator
+    approves the choice, `auto` lets the scheduler choose. Where only one robot can do it, that one does."""
+    confirm_skills: tuple[Pattern, ...] = ()
+    """Shell patterns of skills with which every plan waits until an operator agrees, such as `cut`."""
+
+    def check(self) -> None:
+        """Check what types cannot tell; ConfigError names the key."""
+        for number, limits in enumerate(self.limits):
+            if not limits.robots:
+                raise ConfigError(f"safety.limits[{number}].robots is empty", remedy='give patterns of ids, or "*"')
+        for key in ("places_never", "exclusive_places"):
+            for each in getattr(self, key):
+                if each != each.lower():
+                    raise ConfigError(f"safety.{key}: {each!r}", remedy="write names in lower case")
+
+
+MAX_REASON = 200
+
+
+class StepSoFar(Struct, frozen=True, kw_only=True):
+    """A subtask of the earlier plan. `state` is one of `done`, `running`, `failed`, `open`."""
+
+    id: str
+    skill: str
+    robot: str | None
+    params: dict[str, Any]
+    after: tuple[str, ...]
+    state: str
+    reason: str = ""
+    """Of a failed one: why."""
+
+
+class SoFar(Struct, frozen=True, kw_only=True):
+    """All subtasks of the earlier plan, in its order."""
+
+    steps: tuple[StepSoFar, ...]
+
+    def of(self, state: str) -> tuple[StepSoFar, ...]:
+        """Return those of one state."""
+        return tuple(each for each in self.steps if each.state == state)
+
+
+_STATES = {
+    SubtaskState.SUCCEEDED: "done",
+    SubtaskState.DISPATCHED: "running",
+    SubtaskState.RUNNING: "running",
+    SubtaskState.FAILED: "failed",
+}
+
+
+def so_far(record: TaskRecord) -> SoFar:
+    """Return what has become of a task's plan; a robot that was chosen is named."""
+    return SoFar(
+        steps=tuple(
+            StepSoFar(
+                id=each.subtask.id,
+                skill=each.subtask.skill,
+                robot=each.bound_robot or each.subtask.robot,
+                params=each.subtask.params,
+                after=each.subtask.after,
+                state=_STATES.get(each.state, "open"),
+                reason=each.failure.message[:MAX_REASON] if each.failure else "",
+            )
+            for each in record.subtasks
+        )
+    )
+
 
 KNOWN_TIERS = ("local", "peer", "upstream", "rules")
 """Tiers that can be named in the configuration."""

@@ -4,10 +4,9 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from appliance.llm.routing.budget import Budget
+from appliance.llm.routing import Budget
 from appliance.llm.rules.tier import RulesTier
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig
+from appliance.llm.settings import LlmConfig, SafetyConfig
 from appliance.llm.tier import Planner
 from appliance.model import Tier
 from appliance.skills.catalogue import Catalogue

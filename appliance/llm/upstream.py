@@ -28,10 +28,8 @@ from appliance.errors import (
     SwiftbotError,
     UnreachableError,
 )
-from appliance.llm.prompt import messages
-from appliance.llm.routing.breaker import Breaker
-from appliance.llm.routing.budget import Budget
-from appliance.llm.schema import MAX_ANSWER_BYTES, plan_schema, read_plan
+from appliance.llm.prompt import MAX_ANSWER_BYTES, messages, plan_schema, read_plan
+from appliance.llm.routing import Breaker, Budget
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
 from appliance.model import Plan, Tier, UpstreamStatus

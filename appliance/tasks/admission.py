@@ -10,7 +10,7 @@ from collections.abc import Collection, Generator, Mapping
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError
-from appliance.llm.intake import stop_refused
+from appliance.llm.preprocessing import stop_refused
 from appliance.llm.stop_words import stop_request
 from appliance.model import (
     HIGHEST_PRIORITY,

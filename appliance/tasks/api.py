@@ -36,7 +36,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from appliance.llm.analysis import Analysis
-from appliance.llm.experience.statistic import Row
+from appliance.llm.experience import Row
 from appliance.model import Act, ContainerInfo, Enquiry, Need, Phase, Plan, RunEvent, Signed, TaskRecord, TierAttempt
 from appliance.tasks.lines import Line
 

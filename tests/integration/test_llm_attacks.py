@@ -18,13 +18,10 @@ import pytest
 
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer, Slot
-from appliance.llm.checks.policy import places_of, robots_of
+from appliance.llm.checks.safety import places_of, robots_of
 from appliance.llm.checks.schema import is_unnamed
-from appliance.llm.embedded import EMBEDDED
 from appliance.llm.prompt import messages
-from appliance.llm.safety.settings import RobotLimits, SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.llm.so_far import SoFar, Step
+from appliance.llm.settings import EMBEDDED, LlmConfig, PlanContext, RobotLimits, SafetyConfig, SoFar, StepSoFar
 from appliance.llm.tier import Proposal
 from appliance.model import Box, Place, Plan, RobotInfo, Site, Subtask, Tier
 from appliance.skills.catalogue import load_catalogue
@@ -65,8 +62,8 @@ def context_of(attack: dict[str, Any]) -> PlanContext:
     places = {**PLACES, text.lower(): Place(x=4, y=4)} if kind == "place" else PLACES
     so_far = None
     if kind == "reason":
-        went = Step(id="s1", skill="goto", robot="rover_1", params={"place": "dock 1"}, after=(), state="done")
-        shot = Step(
+        went = StepSoFar(id="s1", skill="goto", robot="rover_1", params={"place": "dock 1"}, after=(), state="done")
+        shot = StepSoFar(
             id="s2",
             skill="photograph",
             robot="rover_1",

@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 from appliance.llm.checks.schema import validate
-from appliance.llm.embedded import EMBEDDED, FOLDER
 from appliance.llm.local import LocalTier
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import EMBEDDED, EMBEDDED_FOLDER, LlmConfig, PlanContext
 from appliance.model import RobotInfo
 from appliance.skills.catalogue import load_catalogue
 
@@ -42,9 +41,9 @@ async def tier() -> AsyncIterator[LocalTier]:
 def test_it_is_in_the_package_and_small() -> None:
     """It is what a gateway has when nothing else is configured: no download, and room on any gateway."""
     assert LlmConfig().local_model == EMBEDDED
-    assert (FOLDER / "planner.json").is_file()
-    assert "## Held-out pairs" in (FOLDER / "README.md").read_text()
-    assert sum(each.stat().st_size for each in FOLDER.rglob("*")) < MOST_MB * 2**20
+    assert (EMBEDDED_FOLDER / "planner.json").is_file()
+    assert "## Held-out pairs" in (EMBEDDED_FOLDER / "README.md").read_text()
+    assert sum(each.stat().st_size for each in EMBEDDED_FOLDER.rglob("*")) < MOST_MB * 2**20
 
 
 @pytest.mark.parametrize(("instruction", "robots", "plan"), ORDERS)
@@ -63,7 +62,7 @@ async def test_plain_orders_are_planned(
         for each in proposal.plan.subtasks
     ]
     assert told == plan
-    assert proposal.model == Path(FOLDER).name
+    assert proposal.model == Path(EMBEDDED_FOLDER).name
 
 
 async def test_it_passes_its_self_test_and_stays_small(tier: LocalTier) -> None:

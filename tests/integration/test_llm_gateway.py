@@ -17,8 +17,7 @@ import pytest
 from appliance.errors import PayloadError, PlanError, SwiftbotError, UnreachableError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.peers import PeerTier, ProposeAsk, Proposed
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig
+from appliance.llm.settings import LlmConfig, SafetyConfig
 from appliance.model import (
     Failure,
     GatewayStatus,

@@ -18,7 +18,7 @@ from appliance.errors import DeadlineError, PlanError, PrerequisiteError, Swiftb
 from appliance.llm.cascade import Decomposer
 from appliance.llm.checks.schema import validate
 from appliance.llm.local import LocalTier
-from appliance.llm.schema import GRAMMAR_SUBTASKS
+from appliance.llm.prompt import GRAMMAR_SUBTASKS
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
@@ -238,7 +238,7 @@ async def test_process_ends_with_its_tier(model: Path) -> None:
 async def test_slot_ends_when_its_gateway_is_gone(model: Path) -> None:
     """The process ends by itself when its input ends, as when a gateway is killed."""
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.llm.slot", str(model),
+        sys.executable, "-m", "appliance.llm.worker", str(model),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(each for each in sys.path if each)},
     )  # fmt: skip

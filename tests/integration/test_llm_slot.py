@@ -116,7 +116,7 @@ async def test_figures_of_the_process(tiny: Callable[..., Path]) -> None:
 
 async def test_places_of_the_site_do_not_cost_the_warm_prefix(tiny: Callable[..., Path]) -> None:
     """A place that looks like a robot's name changes the grammar only where no site knows it."""
-    from appliance.llm.schema import robot_names  # noqa: PLC0415 - what is tested
+    from appliance.llm.prompt import robot_names  # noqa: PLC0415 - what is tested
     from appliance.model import Place  # noqa: PLC0415
 
     site = Site(places={"dock 1": Place(x=1, y=1), "dock 2": Place(x=2, y=2)})

@@ -12,16 +12,14 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError, PrerequisiteError
-from appliance.llm import speaking
+from appliance.llm import decoder
 from appliance.llm.checks.schema import validate
-from appliance.llm.language.coverage import covered
-from appliance.llm.language.evidence import FILE, UNSAID, Evidence, skills_of
-from appliance.llm.language.guide import shapes
-from appliance.llm.language.words import MAX_WORDS, words_of
+from appliance.llm.decoder import FILE, UNSAID, Evidence, Question, covered, skills_of
+from appliance.llm.language import shapes
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.llm.slot import Slot
-from appliance.llm.speaking import Question
+from appliance.llm.words import MAX_WORDS, words_of
+from appliance.llm.worker import Worker
 from appliance.model import RobotInfo, Tier
 from appliance.skills.catalogue import load_catalogue
 
@@ -97,16 +95,16 @@ def test_the_likeliest_whole_answer_is_given(folder: Path, monkeypatch: pytest.M
 
     That is so where coverage counts nothing; where it does, the one given leaves no more unsaid than any surer one.
     """
-    speaker = Slot(folder).speaker
+    speaker = Worker(folder).speaker
     assert speaker is not None
     for instruction in INSTRUCTIONS[:2]:
         question = Question(text=instruction, robots=("rover_1", "drone_1"), skills=shapes(CATALOGUE), deadline_s=60.0)
-        monkeypatch.setattr(speaking, "TURNS", 0)
-        monkeypatch.setattr(speaking, "SAID", 0.0)
+        monkeypatch.setattr(decoder, "TURNS", 0)
+        monkeypatch.setattr(decoder, "SAID", 0.0)
         step_by_step = speaker.answer(question)
-        monkeypatch.setattr(speaking, "TURNS", 12)
-        monkeypatch.setattr(speaking, "FAIR", 0.0)
-        monkeypatch.setattr(speaking, "LONGER", 100)
+        monkeypatch.setattr(decoder, "TURNS", 12)
+        monkeypatch.setattr(decoder, "FAIR", 0.0)
+        monkeypatch.setattr(decoder, "LONGER", 100)
         said = speaker.answer(question)
         answers = [said.symbols, *(each.symbols for each in said.others)]
         sure = [said.confidence, *(each.confidence for each in said.others)]
@@ -115,7 +113,7 @@ def test_the_likeliest_whole_answer_is_given(folder: Path, monkeypatch: pytest.M
         assert step_by_step.symbols in answers
         assert sure == sorted(sure, reverse=True)
         assert said.confidence >= step_by_step.confidence
-        monkeypatch.setattr(speaking, "SAID", 1.0)
+        monkeypatch.setattr(decoder, "SAID", 1.0)
         fuller = speaker.answer(question)
         words = words_of(instruction, question.robots or ())
         surer = [each.symbols for each in fuller.others if each.confidence > fuller.confidence]
@@ -128,11 +126,11 @@ def test_the_words_have_a_say_in_which_answer_is_given(folder: Path, monkeypatch
 
     One on skills that the question does not have changes nothing.
     """
-    speaker = Slot(folder).speaker
+    speaker = Worker(folder).speaker
     assert speaker is not None
-    monkeypatch.setattr(speaking, "TURNS", 12)
-    monkeypatch.setattr(speaking, "FAIR", 0.0)
-    monkeypatch.setattr(speaking, "LONGER", 100)
+    monkeypatch.setattr(decoder, "TURNS", 12)
+    monkeypatch.setattr(decoder, "FAIR", 0.0)
+    monkeypatch.setattr(decoder, "LONGER", 100)
     question = Question(text=INSTRUCTIONS[0], robots=("rover_1",), skills=shapes(CATALOGUE), deadline_s=60.0)
     plain = speaker.answer(question)
     answers = [plain.symbols, *(each.symbols for each in plain.others)]

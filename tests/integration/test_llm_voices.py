@@ -11,14 +11,12 @@ import msgspec
 import pytest
 
 from appliance.errors import PrerequisiteError
-from appliance.llm.language.codec import read
-from appliance.llm.language.guide import shapes
-from appliance.llm.language.words import MAX_WORDS, words_of
+from appliance.llm.decoder import ROOM, Card, Question, TooLongError, Voice, Voices, read_card
+from appliance.llm.language import read, shapes
 from appliance.llm.local import LocalTier
 from appliance.llm.settings import LlmConfig, PlanContext
-from appliance.llm.slot import Slot
-from appliance.llm.speaking import Card, Question, read_card
-from appliance.llm.voices import ROOM, TooLongError, Voice, Voices
+from appliance.llm.words import MAX_WORDS, words_of
+from appliance.llm.worker import Worker
 from appliance.skills.catalogue import load_catalogue
 from workshop.train.card import write_card
 from workshop.train.tokens import Tokens
@@ -121,7 +119,7 @@ def test_together_they_say_the_mean_of_what_each_says(make: Make) -> None:
 
 def test_a_planner_answers_with_all_its_models(make: Make) -> None:
     """Its answer is a plan, the same each time, and what one model says twice is what it says once."""
-    both, twins, alone = (Slot(make(7, *beside)).speaker for beside in ((8,), (7,), ()))
+    both, twins, alone = (Worker(make(7, *beside)).speaker for beside in ((8,), (7,), ()))
     assert both is not None
     assert twins is not None
     assert alone is not None

@@ -17,7 +17,7 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.connection import FleetState
 from appliance.errors import RefusedError
-from appliance.llm.safety.settings import RobotLimits, SafetyConfig
+from appliance.llm.settings import RobotLimits, SafetyConfig
 from appliance.model import RobotCommand, RobotReply, TaskRequest, TaskState, encode
 from appliance.pool.settings import PoolConfig
 from appliance.robots.zenoh_client import ZenohTaskClient

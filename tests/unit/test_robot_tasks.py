@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.errors import RefusedError
-from appliance.llm.safety.settings import SafetyConfig
+from appliance.llm.settings import SafetyConfig
 from appliance.model import Plan, RobotInfo, Subtask, TaskRecord, TaskRequest
 from appliance.plane.node import Plane
 from appliance.robot_tasks import MOST_HANDED_IN, RobotTasks

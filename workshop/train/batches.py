@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from appliance.llm.language.words import MAX_WORDS
+from appliance.llm.words import MAX_WORDS
 from workshop.train.examples import Example
 from workshop.train.lexicon import Lexicon
 from workshop.train.tokens import PAD, Tokens

@@ -6,8 +6,8 @@ from typing import Any
 
 import msgspec
 
-from appliance.llm.language.words import MAX_WORDS
-from appliance.llm.speaking import CARD, Card
+from appliance.llm.decoder import CARD, Card
+from appliance.llm.words import MAX_WORDS
 from appliance.skills.catalogue import Catalogue
 from workshop.train.tokens import BEGIN, END, LITERAL, PLAN, ROSTER, Tokens, symbols_of
 

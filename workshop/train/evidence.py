@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from torch.nn import functional
 
-from appliance.llm.language.evidence import Evidence, cues, skills_of, write_evidence
+from appliance.llm.decoder import Evidence, cues, skills_of, write_evidence
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from workshop.train.corpus import corpus_examples
 from workshop.train.ending import ended

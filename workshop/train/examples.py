@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.llm.language import values
-from appliance.llm.language.codec import Answer, read, write
-from appliance.llm.language.words import words_of
+from appliance.llm import values
+from appliance.llm.language import Answer, read, write
+from appliance.llm.words import words_of
 from appliance.skills.catalogue import Catalogue
 from workshop.corpus.notation import Pair
 

@@ -21,13 +21,11 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, NotFoundError
-from appliance.llm.embedded import folder_of
-from appliance.llm.language.codec import read
-from appliance.llm.language.evidence import write_evidence
-from appliance.llm.language.guide import shapes
-from appliance.llm.language.words import words_of
-from appliance.llm.slot import Slot
-from appliance.llm.speaking import Card, Question, read_card
+from appliance.llm.decoder import Card, Question, read_card, write_evidence
+from appliance.llm.language import read, shapes
+from appliance.llm.settings import folder_of
+from appliance.llm.words import words_of
+from appliance.llm.worker import Worker
 from appliance.skills.catalogue import Catalogue
 from workshop.train.card import card_of, model_card, write_card
 from workshop.train.corpus import corpus_examples
@@ -132,7 +130,7 @@ def calibrate(
     folder: Path, examples: Sequence[Example], catalogue: Catalogue
 ) -> tuple[float, float, list[dict[str, float]]]:
     """Return slope and offset of the confidence, fitted on half of the examples, and the reliability of the others."""
-    slot = Slot(folder)
+    slot = Worker(folder)
     odds: list[float] = []
     right: list[bool] = []
     for example in examples:

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from appliance.errors import PlanError
-from appliance.llm.language.codec import Answer, read
-from appliance.llm.language.words import Words, words_of
+from appliance.llm.language import Answer, read
+from appliance.llm.words import Words, words_of
 from appliance.skills.catalogue import Catalogue
 from workshop.scoring import Score, mean_figures, score
 from workshop.train.examples import Example

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from appliance.llm.language import values
-from appliance.llm.language.codec import ANY
+from appliance.llm import values
+from appliance.llm.language import ANY
 from workshop.train.examples import ROBOT, Example, pointed, spans
 
 MAX_WORDS = 160

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from appliance.llm.language.plurals import singular
+from appliance.llm.words import singular
 from workshop.train.examples import DETERMINERS, Example, spans
 from workshop.train.linking import subtasks_of
 

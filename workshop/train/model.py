@@ -15,8 +15,8 @@ import torch
 from transformers import LlamaConfig, LlamaForCausalLM
 
 from appliance.errors import ConflictError, NotFoundError
-from appliance.llm.embedded import folder_of
-from appliance.llm.speaking import read_card
+from appliance.llm.decoder import read_card
+from appliance.llm.settings import folder_of
 from appliance.skills.catalogue import Catalogue
 from workshop.train.batches import CONTEXT
 from workshop.train.tokens import BEGIN, END, PAD, Tokens

@@ -3,7 +3,7 @@
 import random
 from collections.abc import Sequence
 
-from appliance.llm.language import values
+from appliance.llm import values
 from workshop.train.examples import ROBOT, Example, Span, spans, substitute
 from workshop.train.lexicon import Lexicon
 

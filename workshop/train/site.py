@@ -11,8 +11,8 @@ import msgspec
 from msgspec import Struct
 
 from appliance.errors import NotFoundError, PlanError
-from appliance.llm.intake import refused
-from appliance.llm.language.words import MAX_WORDS, words_of
+from appliance.llm.preprocessing import refused
+from appliance.llm.words import MAX_WORDS, words_of
 from appliance.model import Plan, TaskState
 from appliance.skills.catalogue import Catalogue
 from workshop.corpus.notation import Pair

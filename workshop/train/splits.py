@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from msgspec import Struct
 
-from appliance.llm.language.codec import ANY
+from appliance.llm.language import ANY
 from workshop.train.examples import ROBOT, Example, said, spans
 
 STRUCTURES = 24

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
 
-from appliance.llm.language.words import MAX_WORDS
+from appliance.llm.words import MAX_WORDS
 from appliance.skills.catalogue import Catalogue
 from workshop.corpus.notation import KINDS
 from workshop.train.examples import Example

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from appliance.llm.language import values
-from appliance.llm.language.codec import ANY
+from appliance.llm import values
+from appliance.llm.language import ANY
 from workshop.train.crews import crewed, named
 from workshop.train.examples import ROBOT, Example, inserted, pointed, spans, substitute
 from workshop.train.framing import done_by, framed, fronted, gapped, told

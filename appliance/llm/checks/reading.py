@@ -12,7 +12,7 @@ from functools import lru_cache
 
 from msgspec import Struct, field
 
-from appliance.llm.language.plurals import singular
+from appliance.llm.words import singular
 from appliance.model import RobotInfo
 
 MAX_TOKENS = 4000

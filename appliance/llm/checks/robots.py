@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.finding import Facts, Finding, Severity
-from appliance.llm.checks.policy import robots_of
+from appliance.llm.checks.facts import Facts, Finding, Severity
 from appliance.llm.checks.reading import Token
+from appliance.llm.checks.safety import robots_of
 from appliance.llm.checks.schema import able, is_unnamed
 from appliance.model import Subtask
 

@@ -10,12 +10,11 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.accounting import Claim, claims, text_said
-from appliance.llm.checks.finding import Facts, Finding, Severity
+from appliance.llm.checks.facts import Claim, Facts, Finding, Severity, claims, text_said
 from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import NUMBERS, Token
 from appliance.llm.checks.schema import is_unnamed
-from appliance.llm.language.values import FREE
+from appliance.llm.values import FREE
 from appliance.model import Subtask
 
 _CLOCK = re.compile(
@@ -214,7 +213,7 @@ def _free_values(facts: Facts) -> set[int]:
     """Tokens of texts that are spoken, asked, or waited for: what they forbid is no order."""
     cached = facts.__dict__.get("_free")
     if cached is None:
-        from appliance.llm.checks.accounting import free_said  # noqa: PLC0415
+        from appliance.llm.checks.facts import free_said  # noqa: PLC0415
 
         cached = set[int]()
         for subtask in facts.plan.subtasks:

@@ -11,7 +11,7 @@ from typing import Any
 from msgspec import Struct, field
 
 from appliance.errors import PlanError
-from appliance.llm.rules.phrases import Step
+from appliance.llm.rules.grammar import Step
 from appliance.model import MAX_SUBTASKS, SPLIT, Subtask
 from appliance.skills.catalogue import Catalogue
 

@@ -8,7 +8,7 @@ tells more than a plan for another robot would.
 import re
 from collections.abc import Sequence
 
-from appliance.llm.language.plurals import singular
+from appliance.llm.words import singular
 
 KIND = (
     r"(?:robots?|drones?|rovers?|arms?|uavs?|ugvs?|bots?|carts?|vehicles?|quadcopters?|copters?|"

@@ -12,8 +12,7 @@ from appliance.errors import ConfigError, PlanError, RefusedError, UnreachableEr
 from appliance.llm.cascade import Decomposer, Slot
 from appliance.llm.review import ACCOUNTED
 from appliance.llm.rules.tier import RulesTier
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.tier import Proposal
 from appliance.model import Plan, RobotInfo, Site, Subtask, Tier
 from appliance.skills.catalogue import Catalogue

@@ -10,8 +10,7 @@ from msgspec.structs import replace
 from appliance.errors import ConfigError, PlanError, RefusedError, UnreachableError
 from appliance.llm.cascade import Decomposer, Slot
 from appliance.llm.peers import PeerTier, ProposeAsk, Proposed, candidates
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.tier import Proposal
 from appliance.model import (
     GatewayStatus,

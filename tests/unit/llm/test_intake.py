@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.llm.intake import explained, refused
+from appliance.llm.preprocessing import explained, refused
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ from msgspec.structs import replace
 from appliance.errors import DeadlineError, PlanError
 from appliance.llm.local import LocalTier
 from appliance.llm.review import Facts, review
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.tier import Proposal
 from appliance.model import RobotInfo
 from appliance.skills.catalogue import load_catalogue

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from appliance.errors import PrerequisiteError, UnreachableError
-from appliance.llm import process as module
-from appliance.llm.process import ModelProcess
+from appliance.llm import local as module
+from appliance.llm.local import ModelProcess
 from appliance.llm.settings import LlmConfig
 
 pytestmark = pytest.mark.anyio

@@ -3,7 +3,7 @@
 import pytest
 from msgspec.structs import replace
 
-from appliance.llm.rewriting import told
+from appliance.llm.preprocessing import told
 from appliance.llm.settings import PlanContext
 from appliance.model import Place, Plan, Subtask
 from appliance.skills.sites import load_site

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from appliance.errors import PlanError
 from appliance.llm.checks.schema import validate
 from appliance.llm.rules.lexicon import noun, number, spell
-from appliance.llm.rules.modifiers import take
+from appliance.llm.rules.parser import take
 from appliance.llm.rules.tier import read
 from appliance.llm.settings import PlanContext
 from appliance.model import RobotInfo, Site

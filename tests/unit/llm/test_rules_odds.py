@@ -2,8 +2,7 @@
 
 import pytest
 
-from appliance.llm.rules.odds import odds_right
-from appliance.llm.rules.tier import RulesTier
+from appliance.llm.rules.tier import RulesTier, odds_right
 from appliance.llm.settings import PlanContext
 from appliance.skills.catalogue import load_catalogue
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import PlanError
 from appliance.llm.checks.schema import validate
-from appliance.llm.prompt import EXAMPLES, messages
-from appliance.llm.schema import GRAMMAR_SUBTASKS, plan_grammar, plan_schema, read_plan, robot_names
+from appliance.llm.prompt import EXAMPLES, GRAMMAR_SUBTASKS, messages, plan_grammar, plan_schema, read_plan, robot_names
 from appliance.llm.settings import PlanContext
 from appliance.model import RobotInfo, Site, Tier
 from appliance.skills.catalogue import Catalogue

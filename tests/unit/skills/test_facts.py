@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from appliance.errors import ConfigError
-from appliance.llm.checks.accounting import claims
+from appliance.llm import language
+from appliance.llm.checks.facts import claims
 from appliance.llm.checks.reading import read as read_words
-from appliance.llm.language import codec
-from appliance.llm.language.words import words_of
-from appliance.llm.rules.domains import domain_of
+from appliance.llm.rules.grammar import Step
 from appliance.llm.rules.graph import Graph
-from appliance.llm.rules.phrases import Step
+from appliance.llm.rules.tier import domain_of
+from appliance.llm.words import words_of
 from appliance.model import Subtask
 from appliance.skills.catalogue import SkillManifest, load_catalogue
 
@@ -166,13 +166,13 @@ def test_a_joint_skill_of_another_folder_is_written_by_its_robots(tmp_path: Path
     """The planner's language says the robots of a joint skill and not its robot, which is the first of them."""
     catalogue = load_catalogue([folder(tmp_path / "more", CLAMP)])
     params = {"robots": ["rover_1", "rover_2"], "object": "pipe"}
-    answer = codec.Answer(
+    answer = language.Answer(
         domain="coordination", subtasks=(Subtask(id="s1", skill="clamp", robot="rover_1", params=params),)
     )
     words = words_of("rover_1 and rover_2 clamp the pipe")
-    symbols = codec.write(answer, words, catalogue)
+    symbols = language.write(answer, words, catalogue)
     assert symbols[:3] == ["coordination", "clamp", "robots:"]
-    assert codec.read(symbols, words, catalogue) == answer
+    assert language.read(symbols, words, catalogue) == answer
 
 
 def test_an_incidental_skill_of_another_folder_is_not_what_a_plan_is_about(tmp_path: Path) -> None:

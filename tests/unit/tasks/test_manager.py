@@ -13,10 +13,9 @@ from msgspec.structs import replace
 from appliance.client import _news
 from appliance.errors import DeadlineError, PayloadError, RefusedError, UnreachableError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.experience.statistic import Experience
+from appliance.llm.experience import Experience
 from appliance.llm.review import Review
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.model import (
     Approval,
     Decision,

@@ -8,8 +8,7 @@ from msgspec.structs import replace
 
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.safety.settings import RobotLimits, SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.settings import LlmConfig, PlanContext, RobotLimits, SafetyConfig
 from appliance.model import Failure, Plan, RobotInfo, Site, Subtask, TaskRecord
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import machine

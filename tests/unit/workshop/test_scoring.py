@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.llm.language.codec import read
-from appliance.llm.language.words import words_of
+from appliance.llm.language import read
+from appliance.llm.words import words_of
 from appliance.skills.catalogue import load_catalogue
 from workshop import corpus
 from workshop.bench.plan import default_cases

@@ -9,9 +9,8 @@ from typing import Any
 from appliance.llm.batch import Case as Asked
 from appliance.llm.batch import predicted
 from appliance.llm.cascade import Decomposer, Slot
-from appliance.llm.language.values import figures
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig
+from appliance.llm.settings import LlmConfig, SafetyConfig
+from appliance.llm.values import figures
 from appliance.model import Site
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site

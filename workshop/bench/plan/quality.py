@@ -22,9 +22,8 @@ from msgspec import Struct
 from appliance.errors import NotFoundError, PayloadError, PlanError
 from appliance.llm.batch import everyman, prediction
 from appliance.llm.cascade import Decomposer, Slot
-from appliance.llm.routing.budget import Budget
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import LlmConfig, PlanContext
+from appliance.llm.routing import Budget
+from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.tiers import configured
 from appliance.model import Plan, Tier
 from appliance.skills.catalogue import Catalogue, load_catalogue

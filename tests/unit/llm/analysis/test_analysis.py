@@ -2,9 +2,8 @@
 
 import pytest
 
-from appliance.llm.analysis import analyse
-from appliance.llm.analysis.allocation import starts
-from appliance.llm.analysis.constraints import constraints
+from appliance.llm import analysis
+from appliance.llm.analysis import constraints, starts
 from appliance.model import Plan, RobotInfo, Subtask
 from appliance.skills.catalogue import Catalogue
 
@@ -44,7 +43,7 @@ def test_the_whole_analysis(catalogue: Catalogue, robots: tuple[RobotInfo, ...])
         ),
     )
     took = {"goto": 12.0, "record_video": 5.0}
-    found = analyse(
+    found = analysis(
         "go to dock 1 and film it for a minute",
         plan,
         catalogue,
@@ -77,4 +76,4 @@ def test_circles_and_unknown_skills_do_not_break_it(catalogue: Catalogue) -> Non
         ),
     )
     assert starts(plan, {}) == {}
-    assert analyse("x", plan, catalogue, None).allocation == ()
+    assert analysis("x", plan, catalogue, None).allocation == ()

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from appliance.llm import review as module
 from appliance.llm.completion import completed
 from appliance.llm.review import CHECKS, Facts, review
-from appliance.llm.safety.settings import SafetyConfig
-from appliance.llm.settings import PlanContext
+from appliance.llm.settings import PlanContext, SafetyConfig
 from appliance.model import Finding, Plan, Severity, Subtask, Verdict
 from appliance.skills.catalogue import load_catalogue
 from appliance.skills.sites import load_site

@@ -7,11 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.llm.experience.memory import Memory
-from appliance.llm.experience.outcomes import Outcome, PlanOutcome, outcomes, plan_outcomes
-from appliance.llm.experience.statistic import Experience
-from appliance.llm.routing.budget import Budget
-from appliance.llm.routing.thresholds import Thresholds
+from appliance.llm.experience import Experience, Outcome, PlanOutcome, outcomes, plan_outcomes
+from appliance.llm.feedback import Memory
+from appliance.llm.routing import Budget, Thresholds
 from appliance.model import (
     Attempt,
     Decision,

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.errors import PlanError
-from appliance.llm.language.codec import MAX_SUBTASKS, Answer, read, write
-from appliance.llm.language.words import MAX_WORDS, words_of
+from appliance.llm.language import MAX_SUBTASKS, Answer, read, write
+from appliance.llm.words import MAX_WORDS, words_of
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
 from workshop import corpus

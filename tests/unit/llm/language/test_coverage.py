@@ -1,7 +1,7 @@
 """How much of an instruction an answer says."""
 
-from appliance.llm.language.coverage import covered
-from appliance.llm.language.words import words_of
+from appliance.llm.decoder import covered
+from appliance.llm.words import words_of
 
 
 def test_words_that_are_pointed_at_count_once() -> None:

@@ -5,16 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.llm.embedded import FOLDER
-from appliance.llm.language.evidence import (
-    FILE,
-    Evidence,
-    cues,
-    read_evidence,
-    skills_of,
-    support,
-    write_evidence,
-)
+from appliance.llm.decoder import FILE, Evidence, cues, read_evidence, skills_of, support, write_evidence
+from appliance.llm.settings import EMBEDDED_FOLDER
 from appliance.skills.catalogue import load_catalogue
 
 
@@ -85,7 +77,7 @@ def test_damaged_evidence_is_named(tmp_path: Path, damage: bytes) -> None:
 
 def test_the_embedded_evidence_knows_the_catalogue() -> None:
     """It has an opinion on every skill that the pairs have, and the right one on plain orders."""
-    evidence = read_evidence(FOLDER)
+    evidence = read_evidence(EMBEDDED_FOLDER)
     assert evidence is not None
     assert set(evidence.skills) <= set(load_catalogue().skills)
     assert len(evidence.skills) > 50

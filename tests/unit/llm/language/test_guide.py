@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.llm.language.codec import Answer, read, write
-from appliance.llm.language.guide import END, Guide, shapes
-from appliance.llm.language.ranges import between
-from appliance.llm.language.words import words_of
+from appliance.llm.language import END, Answer, Guide, read, shapes, write
+from appliance.llm.words import between, words_of
 from appliance.skills.catalogue import load_catalogue
 from workshop import corpus
 from workshop.corpus.notation import parse

@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.llm.language.plurals import singular
+from appliance.llm.words import singular
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,7 @@
 
 import pytest
 
-from appliance.llm.language.ranges import between
-from appliance.llm.language.words import words_of
+from appliance.llm.words import between, words_of
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.llm.language import values
+from appliance.llm import values
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.llm.language.words import in_one_line, words_of
+from appliance.llm.words import in_one_line, words_of
 
 
 @pytest.mark.parametrize(

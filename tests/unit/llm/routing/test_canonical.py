@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.llm.routing.canonical import canonical, catalogue_digest, plan_key
+from appliance.llm.plan_cache import canonical, catalogue_digest, plan_key
 from appliance.llm.settings import PlanContext
 from appliance.model import Pose, RobotInfo, Site
 from appliance.skills.catalogue import Catalogue

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from appliance.errors import RefusedError
-from appliance.llm.routing.gate import Gate
+from appliance.llm.routing import Gate
 
 pytestmark = pytest.mark.anyio
 

@@ -6,11 +6,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import ConfigError
-from appliance.llm.routing.breaker import Breaker
-from appliance.llm.routing.budget import Budget, Spent
-from appliance.llm.routing.cache import PlanCache
-from appliance.llm.routing.privacy import Privacy
-from appliance.llm.routing.thresholds import HALF_LIFE_S, Thresholds
+from appliance.llm.plan_cache import PlanCache
+from appliance.llm.routing import OUTCOME_HALF_LIFE_S, Breaker, Budget, Privacy, Spent, Thresholds
 from appliance.llm.settings import PlanContext
 from appliance.model import Plan, Provenance, RobotInfo, Subtask, Tier
 
@@ -181,7 +178,7 @@ def test_a_threshold_rises_over_plans_that_fail_and_comes_back() -> None:
     for _ in range(30):
         thresholds.add("local", 0.7, good=True)
     assert thresholds.of("local") == 0.6
-    clock.now += 20 * HALF_LIFE_S
+    clock.now += 20 * OUTCOME_HALF_LIFE_S
     assert thresholds.all == {"local": 0.6, "rules": 0.8}
 
 

@@ -9,14 +9,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import ConfigError
-from appliance.llm.checks.contradiction import contradictions
-from appliance.llm.checks.finding import Facts
-from appliance.llm.checks.grounding import ungrounded
-from appliance.llm.checks.policy import policy_holds, unsafe
+from appliance.llm.checks.consistency import contradictions
+from appliance.llm.checks.facts import Facts
+from appliance.llm.checks.safety import policy_holds, ungrounded, unsafe
 from appliance.llm.checks.schema import validate
-from appliance.llm.safety.quoting import MOST, quoted
-from appliance.llm.safety.settings import RobotLimits, SafetyConfig
-from appliance.llm.settings import PlanContext
+from appliance.llm.prompt import MOST, quoted
+from appliance.llm.settings import PlanContext, RobotLimits, SafetyConfig
 from appliance.model import Place, Plan, Pose, RobotInfo, Severity, Site, Subtask
 from appliance.skills.catalogue import Catalogue, load_catalogue
 

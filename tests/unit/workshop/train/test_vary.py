@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.llm.language.codec import read
-from appliance.llm.language.words import words_of
+from appliance.llm.language import read
+from appliance.llm.words import words_of
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
 from workshop.corpus.notation import Pair

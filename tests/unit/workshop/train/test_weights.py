@@ -10,7 +10,7 @@ import pytest
 from onnx import numpy_helper
 
 from appliance.errors import NotFoundError, PayloadError
-from appliance.llm.embedded import FOLDER
+from appliance.llm.settings import EMBEDDED_FOLDER
 from workshop.train.weights import read_weights, unpacked
 
 
@@ -19,7 +19,7 @@ def test_the_embedded_planner_gives_its_weights_back() -> None:
 
     Queries and keys are turned by position and values are not: the rows of the one matrix are compared in their order.
     """
-    shape, weights = read_weights(FOLDER)
+    shape, weights = read_weights(EMBEDDED_FOLDER)
     inside = {name for name in weights if name.startswith("model.layers.0.")}
     assert len(weights) == len(inside) * shape.layers + 3
     assert weights["model.layers.0.self_attn.k_proj.weight"].shape == (
@@ -27,7 +27,7 @@ def test_the_embedded_planner_gives_its_weights_back() -> None:
         shape.width,
     )
     assert weights["model.layers.0.mlp.down_proj.weight"].shape == (shape.width, shape.inner)
-    model = onnx.load(FOLDER / "model.onnx")  # pyright: ignore[reportUnknownMemberType]
+    model = onnx.load(EMBEDDED_FOLDER / "model.onnx")  # pyright: ignore[reportUnknownMemberType]
     stored = {each.name: numpy_helper.to_array(each) for each in model.graph.initializer}
     packed = stored["model.layers.0.attn.qkv_proj.MatMul.weight_Q8"].astype(np.int16) - 128
     whole = (packed * stored["model.layers.0.attn.qkv_proj.MatMul.weight_scales"][..., None]).reshape(len(packed), -1)
@@ -38,7 +38,7 @@ def test_the_embedded_planner_gives_its_weights_back() -> None:
 
 def test_rounded_blocks_are_read_as_the_library_wrote_them() -> None:
     """The output matrix, which the library rounded from the embedding, is the embedding again within half a step."""
-    model = onnx.load(FOLDER / "model.onnx")  # pyright: ignore[reportUnknownMemberType]
+    model = onnx.load(EMBEDDED_FOLDER / "model.onnx")  # pyright: ignore[reportUnknownMemberType]
     stored = {each.name: numpy_helper.to_array(each) for each in model.graph.initializer}
     packed, scales = stored["lm_head.MatMul.weight_Q8"], stored["lm_head.MatMul.weight_scales"]
     whole = stored["model.embed_tokens.weight"]
@@ -60,7 +60,7 @@ def test_what_is_no_planner_is_told(tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match=r"has no model\.onnx"):
         read_weights(tmp_path)
     folder = tmp_path / "model"
-    shutil.copytree(FOLDER, folder)
+    shutil.copytree(EMBEDDED_FOLDER, folder)
     config = json.loads((folder / "genai_config.json").read_text())
     config["model"]["decoder"]["num_hidden_layers"] = 7
     (folder / "genai_config.json").write_text(json.dumps(config))

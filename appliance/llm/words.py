@@ -1,4 +1,4 @@
-"""An instruction as numbered words.
+"""An instruction as numbered words; plurals and ranges among them.
 
 A word is a run of letters and digits with what may stand inside a name ("robot_1", "crow's", "a.wav", "B-12", "10:42");
 every other mark is a word of its own, blanks are none. Words keep where they stand, so that a run of them is again the
@@ -7,10 +7,13 @@ text as it was written. The robots of the roster follow as words after the instr
 Lines of a list are read as one sentence: what stands before an item ("2.", "b)", "-") is no figure of the order before
 it, and the end of a line parts as a mark does. A letter stands before an item only where the lines' letters follow one
 another (a, b, c): else it is somebody's initial ("A. Smith waits").
+
+`singular` gives the singular of a name, as people give names to things and places; `between` the numbers and letters
+that are meant without being said, those between the ends of "pumps 4 to 7" and "bays A to D".
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from msgspec import Struct
 
@@ -104,3 +107,86 @@ def _items(lines: Sequence[str]) -> list[re.Match[str] | None]:
             for number in run:
                 items[number] = None
     return items
+
+
+_F = frozenset({"shelves", "halves", "calves", "leaves", "loaves", "wolves", "thieves", "scarves", "hooves", "sheaves"})
+_FE = frozenset({"knives", "wives", "lives"})
+_IE = frozenset(
+    {"cookies", "brownies", "movies", "smoothies", "hoodies", "selfies", "pies", "ties", "zombies", "veggies"}
+)
+_OTHERS = {
+    "shoes": "shoe",
+    "horseshoes": "horseshoe",
+    "snowshoes": "snowshoe",
+    "toes": "toe",
+    "canoes": "canoe",
+    "hoes": "hoe",
+    "buses": "bus",
+    "minibuses": "minibus",
+    "gases": "gas",
+    "lenses": "lens",
+    "viruses": "virus",
+    "axes": "axe",
+    "series": "series",
+    "species": "species",
+}
+
+
+def singular(text: str) -> str:
+    """Return a name with its last word in the singular, and without the 's of its owner.
+
+    Args:
+        text: lower case; its last word is taken to be regular, or one of the common others.
+    """
+    if text.endswith("'s"):
+        return text[:-2]
+    before, blank, word = text.rpartition(" ")
+    return f"{before}{blank}{_one(word)}"
+
+
+def _one(word: str) -> str:
+    if (other := _OTHERS.get(word)) is not None:
+        return other
+    if word in _F:
+        return f"{word[:-3]}f"
+    if word in _FE:
+        return f"{word[:-3]}fe"
+    if word.endswith("shelves"):
+        return f"{word[:-3]}f"
+    if word.endswith("ies") and len(word) > 4:
+        return word[:-1] if word in _IE else f"{word[:-3]}y"
+    if word.endswith(("ches", "shes", "xes", "sses", "oes")):
+        return word[:-2]
+    return word[:-1] if word.endswith("s") and not word.endswith("ss") else word
+
+
+MOST = 20
+"""A longer range is no list of things to do one after the other."""
+_TO = frozenset({"to", "through", "thru", "till", "until", "-", "–", "—", "up"})
+_MARK = re.compile(r"\d{1,4}|[a-z]")
+
+
+def between(words: Words) -> tuple[str, ...]:
+    """Return what lies between the ends of an instruction's ranges, in order, each once; not the ends."""
+    return tuple(dict.fromkeys(mark for first, last in _ends(words) for mark in _inside(first, last)))
+
+
+def _ends(words: Words) -> Iterator[tuple[str, str]]:
+    said = [words[number].lower() for number in range(words.own)]
+    for at, first in enumerate(said):
+        if not _MARK.fullmatch(first):
+            continue
+        end = at + 1
+        while end < len(said) and said[end] in _TO:
+            end += 1
+        if at + 1 < end < len(said) and _MARK.fullmatch(said[end]):
+            yield first, said[end]
+
+
+def _inside(first: str, last: str) -> list[str]:
+    if first.isdigit() and last.isdigit():
+        low, high = int(first), int(last)
+        return [str(each) for each in range(low + 1, high)] if high - low <= MOST and first == str(low) else []
+    if first.isalpha() and last.isalpha():
+        return [chr(each) for each in range(ord(first) + 1, ord(last))] if ord(last) - ord(first) <= MOST else []
+    return []

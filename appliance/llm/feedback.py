@@ -16,11 +16,9 @@ import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
-from appliance.llm.experience.outcomes import outcomes, plan_outcomes
-from appliance.llm.experience.statistic import Experience, Row
-from appliance.llm.routing.budget import Budget, Spent
-from appliance.llm.routing.cache import Kept, PlanCache
-from appliance.llm.routing.thresholds import Thresholds
+from appliance.llm.experience import Experience, Row, outcomes, plan_outcomes
+from appliance.llm.plan_cache import Kept, PlanCache
+from appliance.llm.routing import Budget, Spent, Thresholds
 from appliance.model import Plan, TaskRecord, TaskState, encode
 
 log = structlog.get_logger(__name__)

@@ -2,7 +2,7 @@
 
 Why a process: the library holds Python's lock while it computes (half a second for a long prompt), and a gateway that
 stalls that long loses its leases; and a model that crashes or eats memory must not take the gateway along. Run as
-`python -m appliance.llm.slot FOLDER`, frames on stdin and stdout (`frames`). It ends when stdin ends.
+`python -m appliance.llm.worker FOLDER`, frames on stdin and stdout (`frames`). It ends when stdin ends.
 
 What is kept between prompts: the generator with the tokens it has seen. The next prompt rewinds to the longest common
 prefix, which is the fixed part with the catalogue, so that only the instruction is computed anew. A generator belongs
@@ -25,10 +25,19 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import msgspec
 
 from appliance.llm import frames
-from appliance.llm.embedded import remedy_of
-from appliance.llm.language.evidence import read_evidence
-from appliance.llm.speaking import BrokenOffError, Card, Question, Speaker, TooLateError, read_card
-from appliance.llm.voices import TooLongError, Voice, Voices
+from appliance.llm.decoder import (
+    BrokenOffError,
+    Card,
+    Question,
+    Speaker,
+    TooLateError,
+    TooLongError,
+    Voice,
+    Voices,
+    read_card,
+    read_evidence,
+)
+from appliance.llm.settings import remedy_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -43,7 +52,7 @@ _NEXT = re.compile(r'"after":\[(?:"s\d+",)*"s\d+"$')
 _INDEX = re.compile(r'"id":"s(\d+)"')
 
 
-class SlotError(Exception):
+class WorkerError(Exception):
     """Something that cannot be done, with code and remedy as the gateway's errors have them."""
 
     def __init__(self, code: str, message: str, remedy: str = "") -> None:
@@ -57,10 +66,10 @@ def check_folder(folder: Path) -> None:
     """Refuse a folder that cannot be a model, before the library says it in its own words."""
     remedy = remedy_of(str(folder))
     if not folder.is_dir():
-        raise SlotError("prerequisite", f"there is no model folder {folder}", remedy)
+        raise WorkerError("prerequisite", f"there is no model folder {folder}", remedy)
     for name in _NEEDED:
         if not (folder / name).is_file():
-            raise SlotError("prerequisite", f"model folder {folder} has no {name}", remedy)
+            raise WorkerError("prerequisite", f"model folder {folder} has no {name}", remedy)
 
 
 class _Loaded:
@@ -73,7 +82,7 @@ class _Loaded:
             self.context = int(sizes["context_length"])
             self.vocabulary = int(sizes.get("vocab_size", 0))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SlotError(
+            raise WorkerError(
                 "prerequisite", f"{folder}/genai_config.json is damaged: {error!r}", "copy the model folder again"
             ) from error
         # Untyped, and loading it takes 40 MB that only this process is to pay.
@@ -87,7 +96,7 @@ class _Loaded:
             self.tokenizer = self.og.Tokenizer(self.model)
         except Exception as error:
             # The library raises bare RuntimeErrors for whatever is wrong with the files.
-            raise SlotError(
+            raise WorkerError(
                 "prerequisite",
                 f"model folder {folder} cannot be loaded: {str(error)[:300]}",
                 "copy the folder again; it must be made for onnxruntime-genai",
@@ -109,14 +118,14 @@ def _speaker(folder: Path, loaded: _Loaded, threads: int) -> Speaker | None:
         for name in card.beside:
             other = read_card(folder / name)
             if other is None or other.tokens != card.tokens:
-                raise SlotError("prerequisite", f"{folder / name} has not the tokens of {folder}", again)
+                raise WorkerError("prerequisite", f"{folder / name} has not the tokens of {folder}", again)
             voices.append(_Loaded(folder / name, threads).voice(other))
         return Speaker(Voices(voices), card, evidence=read_evidence(folder))
     except (ValueError, OSError) as error:
-        raise SlotError("prerequisite", str(error), again) from error
+        raise WorkerError("prerequisite", str(error), again) from error
 
 
-class Slot:
+class Worker:
     """One loaded model."""
 
     def __init__(self, folder: Path, *, threads: int = 0, max_tokens: int = 8192) -> None:
@@ -134,15 +143,15 @@ class Slot:
     def say(self, question: dict[str, Any], stop: "Callable[[], bool]" = lambda: False) -> dict[str, Any]:
         """Answer an instruction in the plan language; `question` is a `Question`, the answer a `Said`."""
         if self.speaker is None:
-            raise SlotError("internal", "this model does not speak the plan language")
+            raise WorkerError("internal", "this model does not speak the plan language")
         try:
             return msgspec.to_builtins(self.speaker.answer(msgspec.convert(question, Question), stop))
         except BrokenOffError as error:
-            raise SlotError("cancelled", str(error)) from error
+            raise WorkerError("cancelled", str(error)) from error
         except TooLongError as error:
-            raise SlotError("plan", str(error), "split the instruction") from error
+            raise WorkerError("plan", str(error), "split the instruction") from error
         except TooLateError as error:
-            raise SlotError("deadline", str(error), "raise llm.local_deadline_s") from error
+            raise WorkerError("deadline", str(error), "raise llm.local_deadline_s") from error
 
     def propose(self, request: dict[str, Any], stop: "Callable[[], bool]" = lambda: False) -> dict[str, Any]:
         """Answer a chat under a grammar.
@@ -157,7 +166,7 @@ class Slot:
         began = time.monotonic()
         prompt = [int(token) for token in self._tokenizer.encode(self._render(request["messages"]))]
         if len(prompt) + _SPARE > self._limit:
-            raise SlotError(
+            raise WorkerError(
                 "plan",
                 f"the prompt has {len(prompt)} tokens: the local model may use {self._limit}",
                 "raise llm.local_max_tokens, or use a model with a longer context",
@@ -195,7 +204,7 @@ class Slot:
             generator.append_tokens(prompt[common:])
         except Exception as error:
             self._generator = None
-            raise SlotError("internal", f"the local model failed on the prompt: {str(error)[:300]}") from error
+            raise WorkerError("internal", f"the local model failed on the prompt: {str(error)[:300]}") from error
         self._generator, self._key = generator, grammar
         self._seen = list(prompt)
         return common
@@ -216,9 +225,9 @@ class Slot:
         sure = 1.0
         while not self._generator.is_done():
             if time.monotonic() > deadline:
-                raise SlotError("deadline", "the local model did not end in time", "raise llm.local_deadline_s")
+                raise WorkerError("deadline", "the local model did not end in time", "raise llm.local_deadline_s")
             if stop():
-                raise SlotError("cancelled", "nobody waits for the answer any more")
+                raise WorkerError("cancelled", "nobody waits for the answer any more")
             open_choice = self._open(text, choices)
             logits = self._generator.get_logits() if open_choice else None
             self._generator.generate_next_token()
@@ -279,8 +288,8 @@ def serve(folder: Path, requests: BinaryIO, replies: BinaryIO, *, threads: int, 
     """Load the model and answer until the requests end; return the exit status."""
     began = time.monotonic()
     try:
-        slot = Slot(folder, threads=threads, max_tokens=max_tokens)
-    except SlotError as error:
+        slot = Worker(folder, threads=threads, max_tokens=max_tokens)
+    except WorkerError as error:
         frames.write(replies, {"error": {"code": error.code, "message": error.message, "remedy": error.remedy}})
         return 5
     speaks = slot.speaker is not None
@@ -295,9 +304,9 @@ def serve(folder: Path, requests: BinaryIO, replies: BinaryIO, *, threads: int, 
 
         try:
             if stop():
-                raise SlotError("cancelled", "nobody waits for the answer any more")  # noqa: TRY301 - as the others
+                raise WorkerError("cancelled", "nobody waits for the answer any more")  # noqa: TRY301 - as the others
             reply |= slot.say(request["question"], stop) if "question" in request else slot.propose(request, stop)
-        except SlotError as error:
+        except WorkerError as error:
             reply["error"] = {"code": error.code, "message": error.message, "remedy": error.remedy}
         except Exception as error:  # noqa: BLE001 - supervision boundary: named to the gateway, the slot lives on
             reply["error"] = {"code": "internal", "message": f"the local model failed: {error!r}"[:400], "remedy": ""}
