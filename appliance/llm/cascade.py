@@ -21,8 +21,7 @@ import structlog
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError, SwiftbotError
-from appliance.llm import analysis
-from appliance.llm.analysis import Analysis
+from appliance.llm.analysis import Analysis, analyse
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.completion import completed
 from appliance.llm.feedback import Memory
@@ -343,10 +342,10 @@ class Decomposer:
         """Review a plan that a person or a robot wrote: as any, but the words only give notes."""
         return review(Facts(plan, context, self._catalogue, self._safety, require_implemented=True, edited=True))
 
-    def analysis(self, context: PlanContext, plan: Plan) -> Analysis:
+    def analyse(self, context: PlanContext, plan: Plan) -> Analysis:
         """Return what an instruction asks for, with its plan and by what is known of the skills and robots."""
         known = self.memory.experience
-        return analysis(
+        return analyse(
             context.instruction,
             plan,
             self._catalogue,

@@ -331,7 +331,7 @@ class Card(Struct, frozen=True, kw_only=True):
     twice: bool = False
     """Whether an instruction stands in the prompt twice, first without numbers; one that has no room for it, once."""
     beside: tuple[str, ...] = ()
-    """Folders in this one whose models are asked too (`voices`); they have the same tokens."""
+    """Folders in this one whose models are asked too (`Voices`); they have the same tokens."""
 
 
 class Question(Struct, frozen=True, kw_only=True):

@@ -4,7 +4,7 @@ Servers differ in what `response_format` they take, so a refused `json_schema` f
 to none; what worked is remembered. Failures are sorted by what helps: an answer 429 or 5xx, or no connection, is tried
 again within bounds; a refused key or an unknown model is not. The key is read anew for each request, so that a new one
 needs no restart, and it is never part of a message or a log line. A server that fails again and again is left alone for
-a while (`routing.breaker`), and none is asked once the day's budget is spent: offline is normal.
+a while (`routing.Breaker`), and none is asked once the day's budget is spent: offline is normal.
 """
 
 import asyncio

@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 from msgspec import Struct
 
 from appliance.llm.checks import lexicon as lx
+from appliance.llm.checks.consistency import precedes
 from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import Reading, Token, read, stem
 from appliance.llm.settings import PlanContext, SafetyConfig
@@ -624,8 +625,6 @@ class Facts:
     @cached_property
     def before(self) -> dict[str, set[str]]:
         """For each subtask all that come before it, directly or not."""
-        from appliance.llm.checks.consistency import precedes  # noqa: PLC0415 - it needs this module's neighbours
-
         return precedes(self.plan)
 
     def manifest(self, subtask: Subtask) -> SkillManifest | None:

@@ -23,6 +23,7 @@ _IN_BRACKETS = re.compile(r"\([^()]*\)")
 _NUMBER = r"[-+−]?\d{1,6}(?:\.\d+)?"
 _PAIR = re.compile(rf"(?:^|[(;>]|\b(?:to|via|at|from|through|then|and)\s)\s*({_NUMBER})\s*,\s*({_NUMBER})(?![\w.])")
 """A pair of figures that a route names as a point."""
+_PLAIN = re.compile(r"[a-z0-9_.-]{1,40}")
 _SPLIT = re.compile(r"[,;]|->|→|\b(?:then|and|via|to|from)\b")
 """What stands between the places of a route, as the skills read it."""
 
@@ -136,8 +137,6 @@ def place_problems(subtask: Subtask, site: Site, *, moves: bool = True) -> Itera
 
 
 def _place(name: str, site: Site) -> Iterable[str]:
-    from appliance.llm.checks.schema import shown  # noqa: PLC0415 - schema asks for places, too
-
     found = locate(name, site)
     if found is None:
         like = nearest(name, site)
@@ -149,8 +148,6 @@ def _place(name: str, site: Site) -> Iterable[str]:
 
 
 def _point(found: Place, name: str, site: Site) -> Iterable[str]:
-    from appliance.llm.checks.schema import shown  # noqa: PLC0415
-
     if coordinate(name) is not None and geographic(found, name, site):
         yield f"place {shown(name)} looks like latitude and longitude: give metres of the site, or a place's name"
     elif coordinate(name) is not None and (why := outside(found, site)):
@@ -175,3 +172,12 @@ def _number(value: Any) -> TypeGuard[float]:
         and not isinstance(value, bool)
         and math.isfinite(float(value) if abs(value) < 1e15 else math.inf)
     )
+
+
+def shown(value: Any) -> str:
+    """Show a value of unknown size and kind safely; plain names stand without quotes."""
+    if isinstance(value, str):
+        return value if _PLAIN.fullmatch(value) else ascii(value[:60] + ("..." if len(value) > 60 else ""))
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) <= 10**12):
+        return str(value)
+    return "a huge number" if isinstance(value, int) else f"a {type(value).__name__}"

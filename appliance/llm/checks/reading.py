@@ -16,7 +16,7 @@ from appliance.llm.words import singular
 from appliance.model import RobotInfo
 
 MAX_TOKENS = 4000
-"""Longer texts are cut: `intake` refuses them before."""
+"""Longer texts are cut: `preprocessing` refuses them before."""
 _ONES = [
     "zero",
     "one",

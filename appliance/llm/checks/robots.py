@@ -3,11 +3,12 @@
 from collections.abc import Iterable
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.facts import Facts, Finding, Severity
+from appliance.llm.checks.facts import Facts
 from appliance.llm.checks.reading import Token
 from appliance.llm.checks.safety import robots_of
 from appliance.llm.checks.schema import able, is_unnamed
-from appliance.model import Subtask
+from appliance.llm.checks.wording import forbidden
+from appliance.model import Finding, Severity, Subtask
 
 _NOT_SUBJECT = frozenset(
     (
@@ -115,8 +116,6 @@ def idle_robot(facts: Facts) -> Iterable[Finding]:
         return
     busy = {robot for each in facts.plan.subtasks for robot in robots_of(each)}
     values = set[int]().union(*facts.account.values.values()) if facts.account.values else set[int]()
-    from appliance.llm.checks.wording import forbidden  # noqa: PLC0415 - words ask for robots, too
-
     skip = values | forbidden(facts)
     idle = {
         robot

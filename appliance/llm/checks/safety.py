@@ -18,12 +18,12 @@ from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from appliance.llm.checks.consistency import NUMBERS, precedes
-from appliance.llm.checks.facts import Facts, Finding, Severity
-from appliance.llm.checks.places import known_as, parts_of, spot_of
-from appliance.llm.checks.schema import MAX_PROBLEMS, able, is_unnamed, shown
+from appliance.llm.checks.facts import Facts
+from appliance.llm.checks.places import known_as, parts_of, shown, spot_of
+from appliance.llm.checks.schema import MAX_PROBLEMS, able, is_unnamed
 from appliance.llm.settings import PlanContext, RobotLimits, SafetyConfig
 from appliance.llm.values import figures
-from appliance.model import Plan, RobotInfo, Site, Subtask
+from appliance.model import Finding, Plan, RobotInfo, Severity, Site, Subtask
 from appliance.skills.catalogue import Catalogue
 
 PLACES = ("place", "area", "station", "path", "at", "to", "into", "asset", "target", "object")

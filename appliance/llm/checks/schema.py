@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from appliance.llm.checks.places import place_problems
+from appliance.llm.checks.places import place_problems, shown
 from appliance.model import MAX_SUBTASKS, SPLIT, Plan, RobotInfo, Site, Subtask, oversize
 from appliance.skills.catalogue import Catalogue, Param, SkillManifest
 
@@ -24,7 +24,6 @@ MAX_NUMBER = 1_000_000.0
 
 _ID = re.compile(r"[a-z][a-z0-9_]{0,30}")
 _ROBOT = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
-_PLAIN = re.compile(r"[a-z0-9_.-]{1,40}")
 _ANY = re.compile(r"any\d{0,2}")
 
 
@@ -250,12 +249,3 @@ def _assign(name: str, fits: dict[str, list[str]], taken: dict[str, str]) -> boo
                     robot = previous  # noqa: PLW2901 - walks the path back
             queue.append(taken[robot])
     return False
-
-
-def shown(value: Any) -> str:
-    """Show a value of unknown size and kind safely; plain names stand without quotes."""
-    if isinstance(value, str):
-        return value if _PLAIN.fullmatch(value) else ascii(value[:60] + ("..." if len(value) > 60 else ""))
-    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) <= 10**12):
-        return str(value)
-    return "a huge number" if isinstance(value, int) else f"a {type(value).__name__}"

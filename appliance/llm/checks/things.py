@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.facts import Facts, Finding, Severity
+from appliance.llm.checks.facts import Facts
 from appliance.llm.checks.reading import stem
-from appliance.model import Site, SiteObject, Subtask
+from appliance.model import Finding, Severity, Site, SiteObject, Subtask
 from appliance.skills.catalogue import SkillManifest
 
 REACH_M = 2.0

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.facts import Claim, Facts, Finding, Severity, claims, text_said
+from appliance.llm.checks.facts import Claim, Facts, claims, free_said, text_said
 from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import NUMBERS, Token
 from appliance.llm.checks.schema import is_unnamed
 from appliance.llm.values import FREE
-from appliance.model import Subtask
+from appliance.model import Finding, Severity, Subtask
 
 _CLOCK = re.compile(
     r"\b(?:[01]?\d|2[0-3]):[0-5]\d\b|\b\d{1,2}\s*(?:am\b|pm\b|a\.m|p\.m|o'clock|h\b(?=\s*(?:sharp|today)))",
@@ -213,8 +213,6 @@ def _free_values(facts: Facts) -> set[int]:
     """Tokens of texts that are spoken, asked, or waited for: what they forbid is no order."""
     cached = facts.__dict__.get("_free")
     if cached is None:
-        from appliance.llm.checks.facts import free_said  # noqa: PLC0415
-
         cached = set[int]()
         for subtask in facts.plan.subtasks:
             for name, value in subtask.params.items():

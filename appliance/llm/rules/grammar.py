@@ -722,7 +722,7 @@ HANDLING.on("visit reach", r" (?P<p>.+)")(
 )
 
 
-_PARTS = (PATTERNS, PATTERNS, PATTERNS, PATTERNS)
+_PARTS = (SENSING, TELLING, MOVING, HANDLING)
 
 
 def steps_of(lemma: str, rest: str, scope: Scope) -> tuple[list[Step], str] | None:

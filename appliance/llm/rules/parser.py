@@ -93,7 +93,7 @@ _TIMES = (
 )
 
 
-def take(text: str, *, altitude: bool) -> tuple[str, Modifiers]:
+def take_modifiers(text: str, *, altitude: bool) -> tuple[str, Modifiers]:
     """Return the clause without its quantities, and the quantities.
 
     Args:
@@ -432,19 +432,19 @@ class Reader:
         )
         if lemma in ("wait", "hold", "hover", "stay", "pause", "remain"):
             tail = re.sub(rf"^(?=(?:about |another )?{lx.NUMBER} ?{lx.TIME_UNIT})", "for ", tail, flags=re.IGNORECASE)
-        rest, quantities = take(tail, altitude=lifted)
+        rest, quantities = take_modifiers(tail, altitude=lifted)
         return self._match(lemma, rest, quantities)
 
     def _by_phrase(self, text: str) -> tuple[list[Step], str, float, dict[str, Any]] | None:
         """Read a clause by the phrases of skills that are not built in."""
-        rest, quantities = take(text, altitude=False)
+        rest, quantities = take_modifiers(text, altitude=False)
         if (step := self._added.step(rest, self)) is None:
             return None
         return [step], "", self._give_quantities([step], quantities) + self._doubt([step]), quantities.values
 
     def _nominal(self, text: str) -> tuple[list[Step], str, float, dict[str, Any]] | None:
         """Read "three photos of the stage", "thermal scan of X", "frames at 12 fps"."""
-        rest, quantities = take(text, altitude=False)
+        rest, quantities = take_modifiers(text, altitude=False)
         low = rest.lower()
         if re.match(rf"(?:{lx.NUMBER} )?(?:\w+ )?{PICTURES} of ", low):
             return self._match("take", rest, quantities)
@@ -524,7 +524,7 @@ class Reader:
         if match is None or (lemma := lx.LEMMA.get(match["verb"].lower())) is None:
             return None
         self._group = speaking_to
-        rest, quantities = take(f"{match['what']}{match['rest']}", altitude=False)
+        rest, quantities = take_modifiers(f"{match['what']}{match['rest']}", altitude=False)
         found = self._match(lemma, rest, quantities)
         return Clause(Who(), found[0], found[1], words, found[2], found[3]) if found else None
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from appliance.errors import PlanError
 from appliance.llm.checks.schema import validate
 from appliance.llm.rules.lexicon import noun, number, spell
-from appliance.llm.rules.parser import take
+from appliance.llm.rules.parser import take_modifiers
 from appliance.llm.rules.tier import read
 from appliance.llm.settings import PlanContext
 from appliance.model import RobotInfo, Site
@@ -395,13 +395,13 @@ def test_numbers(text: str, value: float | None) -> None:
 )
 def test_quantities_come_in_the_parameters_unit(text: str, key: str, value: float) -> None:
     """Quantities are converted to the unit that the parameter's name carries."""
-    assert take(text, altitude=False)[1].values == {key: value}
+    assert take_modifiers(text, altitude=False)[1].values == {key: value}
 
 
 def test_altitude_in_feet() -> None:
     """An altitude in feet becomes metres, and only where something takes off."""
-    assert take("off to 100 feet", altitude=True)[1].values == {"altitude_m": 30.48}
-    assert take("to 100 feet", altitude=False)[1].values == {}
+    assert take_modifiers("off to 100 feet", altitude=True)[1].values == {"altitude_m": 30.48}
+    assert take_modifiers("to 100 feet", altitude=False)[1].values == {}
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,7 @@
 
 import pytest
 
-from appliance.llm import analysis
-from appliance.llm.analysis import constraints, starts
+from appliance.llm.analysis import analyse, constraints, starts
 from appliance.model import Plan, RobotInfo, Subtask
 from appliance.skills.catalogue import Catalogue
 
@@ -43,7 +42,7 @@ def test_the_whole_analysis(catalogue: Catalogue, robots: tuple[RobotInfo, ...])
         ),
     )
     took = {"goto": 12.0, "record_video": 5.0}
-    found = analysis(
+    found = analyse(
         "go to dock 1 and film it for a minute",
         plan,
         catalogue,
@@ -76,4 +75,4 @@ def test_circles_and_unknown_skills_do_not_break_it(catalogue: Catalogue) -> Non
         ),
     )
     assert starts(plan, {}) == {}
-    assert analysis("x", plan, catalogue, None).allocation == ()
+    assert analyse("x", plan, catalogue, None).allocation == ()
