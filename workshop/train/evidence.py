@@ -1,6 +1,6 @@
 # pyright: basic, reportMissingImports=false
 # PyTorch is of the extra `train`, which neither gateways nor the development environment have.
-"""Trains the second opinion on answers (`language.evidence`) and writes it into a model folder; `export` does so too.
+"""Trains the second opinion on answers (`decoder.Evidence`) and writes it into a model folder; `export` does so too.
 
     python -m workshop.train.evidence FOLDER
 

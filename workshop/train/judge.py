@@ -2,7 +2,7 @@
 # PyTorch is of the extra `train`, which neither gateways nor the development environment have.
 """How well a model answers examples, as the scorer counts it.
 
-It answers greedily and held by nothing: what the guide adds (`language.guide`) is seen by the benchmark of plans.
+It answers greedily and held by nothing: what the guide adds (`language.Guide`) is seen by the benchmark of plans.
 """
 
 from collections.abc import Sequence
