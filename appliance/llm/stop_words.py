@@ -14,6 +14,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from enum import Enum, unique
 
+import msgspec
 from msgspec import Struct
 
 
@@ -33,6 +34,8 @@ def stop_request(text: str, robots: Sequence[str] = ()) -> StopRequest | None:
         text: as it was typed.
         robots: the roster's names.
     """
+    if (wrapped := _in_json(text, robots)) is not None:
+        return wrapped
     sentences = list(_sentences(_unquoted(_plain(text))))
     if not any(_has_stop(each.tokens) for each in sentences):
         return None
@@ -57,8 +60,31 @@ def stop_request(text: str, robots: Sequence[str] = ()) -> StopRequest | None:
     )
 
 
+def _in_json(text: str, robots: Sequence[str]) -> StopRequest | None:
+    """Return the stop that a flat JSON object gives as its command: {"cmd": "stop", "robots": "all"}."""
+    if not text.lstrip().startswith("{") or len(text) > _MOST_JSON:
+        return None
+    try:
+        found = msgspec.json.decode(text, type=dict[str, str | list[str] | int | float | bool | None])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    command = next((each for name, each in found.items() if name.casefold() in _COMMAND and isinstance(each, str)), "")
+    if not command or (stop := stop_request(command, robots)) is None or command.lstrip().startswith("{"):
+        return None
+    named = [name for each in found.values() for name in ([each] if isinstance(each, str) else each or ())
+             if isinstance(each, str | list) and name in robots]  # fmt: skip
+    return StopRequest(tuple(dict.fromkeys(named))) if named and not stop.robots else stop
+
+
+_MOST_JSON = 4096
+"""Characters of a command written as JSON."""
+_COMMAND = frozenset(("cmd", "command", "action", "op", "verb", "instruction"))
+
+
 def mentions_stop(text: str) -> bool:
     """Return whether a text has a stop word at all: only then the roster matters to `stop_request`."""
+    if text.lstrip().startswith("{") and "stop" in text.casefold():
+        return True
     return any(_has_stop(each.tokens) for each in _sentences(_unquoted(_plain(text))))
 
 
@@ -198,6 +224,7 @@ _WORDS: dict[_Kind, str] = {
         nie ruszaj sie|zatrzymanie awaryjne""",
     _Kind.COURTESY: """
         please|pls|plz|plse|kindly|now|right now|right away|immediately|instantly|at once|asap|quick|quickly|fast|
+        bloody|damned|freaking|goddamn|stupid|
         just|hey|hi|hello|ok|okay|oh|ah|oi|whoa|god|my god|omg|damn|damn it|dammit|shit|fuck|fucking|crap|argh|help|
         emergency|danger|careful|watch out|look out|attention|warning|urgent|i said|i say|i repeat|repeat|thanks|
         thank you|sir|for now|for god's sake|for heaven's sake|for fuck's sake|this instant|this second|this minute|
@@ -520,7 +547,9 @@ def _with_reason(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | 
             continue
         heard = _clause(tokens[:at], roster, budget, first=said.first)
         # "stop something": without robots only a thing that is there is a reason.
-        if heard is not None and (heard.robots or heard.everything or tokens[at].startswith("there")):
+        if heard is not None and (
+            heard.robots or heard.everything or tokens[at].startswith(("there", "because", "cos"))
+        ):
             return heard
     return None
 

@@ -207,10 +207,24 @@ def number_said(reading: Reading, value: float, unit: str) -> set[int] | None:
                 if said is not None and abs(float(said) - value) <= 1e-3 * max(1.0, abs(value)):
                     best = length
         scaled = at + best < len(tokens) and tokens[at + best].text in ("times", "time") and unit
-        if best and not scaled:  # "four times as high" is no 4 m
+        if best and not scaled and not _goes_on(tokens, at + best):  # "four times as high" is no 4 m
             found.update(range(at, at + best))
         at += max(1, best)
     return found or None
+
+
+def _goes_on(tokens: Sequence[Token], index: int) -> bool:
+    """Whether a number in words goes on: "thirty one" is no 30."""
+    if not 0 < index < len(tokens):
+        return False
+    tens, ones = tokens[index - 1], tokens[index]
+    return (
+        tens.text.endswith("ty")
+        and tens.value is not None
+        and ones.value is not None
+        and ones.text.isalpha()
+        and 1 <= ones.value <= 9
+    )
 
 
 _PER = frozenset(("/", "per", "mps", "mph", "kmh", "kph", "knot", "knots"))
@@ -449,13 +463,18 @@ def claims(reading: Reading, catalogue: Catalogue, *, taken: Iterable[int] = ())
         for words, skills in table.get(token.text, ()):
             at = _phrase_at(reading, start, words, kept)
             # "take drone_1 to the gate": a robot that is brought somewhere goes there itself.
-            brought = start + 1 < len(tokens) and tokens[start + 1].kind == "robot" and _carries(skills, catalogue)
+            robot = start + 1 < len(tokens) and tokens[start + 1].kind == "robot"
+            brought = robot and token.text not in _EMPTIES and _carries(skills, catalogue)
             if at:
                 text = " ".join(tokens[index].text for index in at)
                 options.append(Claim(at, text, skills | _ways(catalogue) if brought else skills))
         if options:
             found.append(options)
     return found
+
+
+_EMPTIES = frozenset(("unload", "unloads", "offload", "load", "loads", "empty", "drop", "release", "leave"))
+"""Verbs of handling whose object stays where it is, or is no robot: "unload the truck"."""
 
 
 def _ways(catalogue: Catalogue) -> frozenset[str]:

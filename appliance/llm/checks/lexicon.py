@@ -29,6 +29,9 @@ FILLER_PHRASES = (
     "i'd appreciate it if", "we'd appreciate it if", "it'd be good if", "it would be good if", "be so kind as to",
     "make their way", "make its way", "make your way", "the way to", "hi there", "hello there", "hey there", "hey team",
     "hi team",
+    "my friend", "hey buddy", "buddy", "pal", "lads", "colleague", "dear colleague", "so much", "very much", "ta",
+    "when you get a sec", "when you get a second", "when you get a moment", "when you get a minute", "is wanted at",
+    "is wanted in", "wants to be at", "wants to be in", "- >", "->", "when you're ready", "when you are ready",
     "could you please", "would ROBOT mind", "mind sending", "mind flying", "mind driving", "mind going", "mind taking",
     "mind moving", "mind bringing", "mind getting", "mind having",
     "where it is", "where it stands", "where they are", "at the end", "in position", "has answered",
@@ -93,9 +96,9 @@ CORRECTIONS = _set("no scratch sorry actually correction rather oops wrong inste
 AGAIN = _set("twice thrice again times each every more both")
 """Words that ask for a thing more than once."""
 RESULTS = _set(
-    "result results finding findings reading readings picture pictures photo photos photograph photographs image "
-    "images video footage recording recordings scan scans map maps count counts detection detections update updates "
-    "transcript report data clip clips sound audio list round"
+    "result results finding findings reading readings pic pics picture pictures photo photos photograph photographs "
+    "image images video footage recording recordings scan scans map maps count counts detection detections "
+    "update updates transcript report data clip clips sound audio list round"
 )
 """Nouns for what earlier steps bring: a later step works on them without naming them in the plan."""
 SUBJECTS = _set(
@@ -103,6 +106,8 @@ SUBJECTS = _set(
     "leaks condition number people obstacles anomalies defects faults issues problems"
 )
 """Nouns for what may be reported without "about"."""
+WAYS = _set("goto dock")
+"""Skills that go to the place they name."""
 PRONOUNS = _set("it them they he she him her his its that this these those there here")
 """Words that stand for something said before."""
 THINGS = _set("it that this them these those")

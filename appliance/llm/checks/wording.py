@@ -266,6 +266,8 @@ def negation(facts: Facts) -> Iterable[Finding]:
                 message=f'the instruction forbids this action: "{scope.words[0]}", and the plan does it ({does})',
                 hint="say only what the robots are to do; to halt robots: swiftbot stop",
             )  # fmt: skip
+        elif scope.kept and {facts.reading.tokens[each].text for each in scope.at} & _SORRY:
+            yield _hold("correction", f'"{scope.words[0]}" takes something back', scope.words)
         elif scope.kept:
             inside = set(scope.at)
             if not any(each - inside for each in facts.account.evidence.values()):
@@ -277,6 +279,9 @@ def negation(facts: Facts) -> Iterable[Finding]:
                 )  # fmt: skip
         else:
             yield _hold("negation", f'the plan does not account for "{scope.words[0]}"', scope.words)
+
+
+_SORRY = lx.CORRECTIONS - {"no", "instead", "rather"}
 
 
 # --- conditions -----------------------------------------------------------------------------------------------------
@@ -538,6 +543,64 @@ _WHAT = frozenset(("what", "how", "whether", "where", "which", "who", "anything"
 _SUBJECTS = (lx.RESULTS - {"data", "list", "round"}) | lx.SUBJECTS
 
 
+def left_alone(facts: Facts) -> Iterable[Finding]:
+    """A robot that is to be left or kept where it is does not move: "leave the drone on its pad"."""
+    tokens = facts.reading.tokens
+    for number, token in enumerate(tokens):
+        if token.text not in ("leave", "leaving", "keep", "keeping") or number in _free_values(facts):
+            continue
+        index = number + 1
+        while index < len(tokens) and tokens[index].text in _ARTICLES:
+            index += 1
+        if index == len(tokens) or tokens[index].kind != "robot":
+            continue
+        kept = frozenset(tokens[index].robots)
+        end = _clause_end(tokens, index, stops=frozenset(("and", "then", "but", "while")))
+        said = set(range(index, end))
+        for subtask in facts.plan.subtasks:
+            manifest = facts.manifest(subtask)
+            moves = manifest is not None and manifest.moves_robot
+            if moves and subtask.robot in kept and facts.account.values[subtask.id] & said:
+                words = facts.words(range(number, end))
+                yield _hold("negation", f'{subtask.id}: "{words}" leaves {subtask.robot} where it is', (words,))
+
+
+def shared_figures(facts: Facts) -> Iterable[Finding]:
+    """A figure that counts for each of several robots is given to each: "take off, ten metres each"."""
+    tokens = facts.reading.tokens
+    covered = facts.account.covered
+    if not any(each.text in ("each", "apiece") and n and n not in covered for n, each in enumerate(tokens)):
+        return
+    for subtask in facts.plan.subtasks:
+        for name, value in subtask.params.items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            lacking = [
+                each.id for each in facts.plan.subtasks if each.skill == subtask.skill and name not in each.params
+            ]
+            if lacking:
+                yield _hold("assignment", f'"each" gives {name} to {", ".join(lacking)} too', ("each",))
+                return
+
+
+def said_first(facts: Facts) -> Iterable[Finding]:
+    """What is said to come first does: "find the cone, go to the shelf first"."""
+    tokens = facts.reading.tokens
+    for number, token in enumerate(tokens):
+        ends = number + 1 == len(tokens) or tokens[number + 1].kind == "mark"
+        if token.text != "first" or not ends or number in facts.account.covered:
+            continue
+        begin = number
+        while begin and tokens[begin - 1].kind != "mark" and tokens[begin - 1].text not in ("and", "but", "then"):
+            begin -= 1
+        here = set(range(begin, number))
+        first = [each for each in facts.plan.subtasks if facts.account.called[each.id] & here]
+        for one in first:
+            others = (each for each in facts.plan.subtasks if each not in first and each.robot == one.robot)
+            if late := [each.id for each in others if one.id not in facts.before[each.id]]:
+                yield _hold("sequence", f"{one.id} is said to come first, and {', '.join(late)} does", ("first",))
+
+
 def late_waits(facts: Facts) -> Iterable[Finding]:
     """What is to happen once something has happened comes after the wait for it."""
     tokens = facts.reading.tokens
@@ -707,7 +770,9 @@ def leaving(facts: Facts) -> Iterable[Finding]:
             before = index - 1
             while before > 0 and tokens[before].text in ("the", "a", "our"):
                 before -= 1
-            if before > 0 and (tokens[before - 1].text, tokens[before].text) in lx.AWAY:
+            away = before > 0 and (tokens[before - 1].text, tokens[before].text) in lx.AWAY
+            alone = subtask.skill in lx.WAYS and before > 0 and tokens[before].text == "from"
+            if away or (alone and len(facts.plan.subtasks) == 1):
                 words = f"{tokens[before - 1].text} {tokens[before].text}"
                 yield _hold("polarity", f'{subtask.id}: the words say "{words}", and the plan goes there', (words,))
                 break
@@ -751,9 +816,22 @@ def _free_text(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterabl
         yield f'{name} "{value}" names nobody and nothing'
     if not quoted and last and (last[0] in lx.NEGATIONS or "..." in value):
         yield f'"{value}" takes something back at its end'
+    place = re.search(r" (?:at|in|by|near) (?:the )?([\w ]+)$", value.lower())
+    if (
+        name == "text"
+        and not quoted
+        and place
+        and facts.site is not None
+        and facts.site.find(place.group(1)) is not None
+    ):
+        yield f'"{place.group().strip()}" may be where it is to be spoken'
     if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
         yield "a robot cannot speak to the operator: notify does"
     words = set(re.findall(r"[a-z]+", value.lower()))
+    inner = sorted(free_said(facts.reading, value) or ())[1:]
+    swallowed = any(facts.reading.tokens[index].kind == "robot" for index in inner)
+    if name == "event" and (swallowed or re.search(r"\b(?:shall|should|must|please|then)\b", value.lower())):
+        yield f'"{value}" is more than something that happens'
     if name == "event" and re.match(r"(?:there|here|at|in|on)\b", value.lower()):
         yield f'"{value}" is where something is, and nothing that happens'
     if name == "event" and (words <= _NO_EVENT or set(value.lower().split()[-1:]) & lx.DURATIONS):
@@ -766,6 +844,8 @@ def _name(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str
     low = value.lower()
     if low in _NOBODY:
         yield f'{name} "{value}" names nobody and nothing'
+    if name in ("to", "person") and set(low.split()) & {"over", "through", "via", "by", "using", "on"}:
+        yield f'{name} "{value}" is more than a name'
     if (facts.site is not None and facts.site.find(value) is not None) or coordinate(value) is not None:
         return
     if low in _CHANGING or (name in _THINGS and re.fullmatch(r"[a-z]+ing", low) and low not in lx.NOUNS_IN_ING):
@@ -876,7 +956,7 @@ def coverage(facts: Facts) -> Iterable[Finding]:
             continue  # `question` looks at these
         if token.kind == "word" and (token.text in special or token.text in lx.FILLERS):
             continue
-        if token.kind == "word" and token.text in lx.RESULTS and _later(facts, number):
+        if token.kind == "word" and token.text in lx.RESULTS and _later(facts, number) and not _alone(tokens, number):
             continue
         if token.kind == "word" and token.text in lx.UNITS and number and tokens[number - 1].value is not None:
             continue
@@ -900,6 +980,12 @@ def coverage(facts: Facts) -> Iterable[Finding]:
             words,
             hint="leave these words out, or say it otherwise",
         )
+
+
+def _alone(tokens: Sequence[Token], number: int) -> bool:
+    """Whether a word is a clause of its own, and so an order: "dock 2, photo."."""
+    before, after = number == 0 or tokens[number - 1].kind == "mark", number + 1 == len(tokens)
+    return before and (after or tokens[number + 1].kind == "mark")
 
 
 def _later(facts: Facts, number: int) -> bool:
