@@ -71,8 +71,10 @@ def _in_json(text: str, robots: Sequence[str]) -> StopRequest | None:
     command = next((each for name, each in found.items() if name.casefold() in _COMMAND and isinstance(each, str)), "")
     if not command or (stop := stop_request(command, robots)) is None or command.lstrip().startswith("{"):
         return None
-    named = [name for each in found.values() for name in ([each] if isinstance(each, str) else each or ())
-             if isinstance(each, str | list) and name in robots]  # fmt: skip
+    named: list[str] = []
+    for value in found.values():
+        values: list[str] = [value] if isinstance(value, str) else value if isinstance(value, list) else []
+        named += [name for name in values if name in robots]
     return StopRequest(tuple(dict.fromkeys(named))) if named and not stop.robots else stop
 
 
