@@ -209,7 +209,7 @@ async def test_a_newcomer_asks_one_for_all(
     tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a large fleet a newcomer has all facts from one member, with their ages; a client likewise."""
-    monkeypatch.setattr(registry, "FEW", 2)
+    monkeypatch.setattr(registry, "FEW_MEMBERS", 2)
     endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(5)]
     async with contextlib.AsyncExitStack() as stack:
         planes: list[Plane] = []
@@ -252,7 +252,7 @@ async def test_containers_told_before_a_newcomer_listened_are_asked_for(
     tmp_path: Path, free_ports: Callable[..., list[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A status that comes before the answer for all does not hide that its gateway has told its containers earlier."""
-    monkeypatch.setattr(registry, "FEW", 1)
+    monkeypatch.setattr(registry, "FEW_MEMBERS", 1)
     endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(4)]
     async with contextlib.AsyncExitStack() as stack:
         planes: list[Plane] = []
